@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import mvest
-from mvest.exchange.segmentations import write_sequence_nrrd
+from mvest.exchange.volumes import write_sequence_nrrd
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.simulation.motion import DrawnValve, MotionSettings, close_in_motion

@@ -41,11 +41,9 @@ def load_series(index):
 
 
 def load_folder(folder):
-    """Everything: series, segmentations and landmarks."""
+    """Load all series and landmarks."""
     for index in sorted(folder.glob("*.pvd")):
         load_series(index)
-    for file in sorted(folder.glob("*.seg.nrrd")):
-        slicer.util.loadSegmentation(str(file)).SetDisplayVisibility(False)
     for file in sorted(folder.glob("*.mrk.json")):
         slicer.util.loadMarkups(str(file))
     slicer.util.resetThreeDViews()

@@ -1,9 +1,8 @@
 """The only place with Hydra and MLflow: compose, build, run, log, collect.
 
-Importing it caps the threads of the numerical libraries before any of them is loaded, unless the
-user has set them: parallelism is over runs, and results do not depend on the machine's cores. It
-also has garbage looked for seldom, and not at all in a process that ends: the many objects that
-imports make stay to the end, and looking through them takes a fifth of a short run.
+Importing it caps the threads of the numerical libraries at one, unless the user has set them:
+parallelism is over runs, and results do not depend on the number of cores. Garbage is collected
+seldom, and not at exit: going through the many objects of the imports takes a fifth of a short run.
 """
 
 import atexit

@@ -9,106 +9,116 @@ from __future__ import annotations
 import difflib
 import pkgutil
 import re
-import resource
-import shutil
 import sys
 import textwrap
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from experiments.common.places import EXPERIMENTS
+import mvest
+from experiments.common.places import CONF, EXPERIMENTS
 from experiments.console import Parser, interruptible
-from mvest import __version__
 from mvest.errors import ConfigurationError, InputError
 
 NUMBA_SETTINGS = Path(".numba_config.yaml")
-"""A file that would make numba load compiled code from a folder of its choice."""
+"""A file that would make numba load compiled code from any folder."""
 
-LEAST_GB = 1.2
-"""Address space that loading the libraries takes; with less they fail in many ways."""
+WIDTH = 100
+"""Characters of a line of help."""
 
-CHECK = "only read, check and draw it, in seconds, and say what an estimate would be able to tell"
-EXAMPLES = {"own-valve": "examples/case", "volume": "examples/volume.seq.nrrd"}
-OVERRIDES = "settings as in `mvest run`, for example seed=2 or imaged.pressure_mmHg=120"
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One command of ``mvest``.
+
+    Attributes
+    ----------
+    about, example : str
+        For the help.
+    run : callable or str
+        Parsed arguments -> exit status; or the name of a function that gets the words themselves.
+    arguments : mapping
+        Name -> arguments of `argparse.ArgumentParser.add_argument`.
+    """
+
+    about: str
+    example: str
+    run: Callable[[Namespace], int] | str
+    arguments: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def parser(self, name: str) -> Parser:
+        """The parser of its arguments, which are paths unless they say otherwise."""
+        parser = Parser(f"mvest {name}", self.about, f"mvest {name} {self.example}".rstrip())
+        for one, how in self.arguments.items():
+            path = {} if "action" in how else {"type": Path}
+            parser.add_argument(one, **{**path, **how})
+        return parser
 
 
 @interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command on its arguments, those of the command line by default; the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    command, rest = (given[0], given[1:]) if given else ("--help", [])
+    name, rest = (given[0], given[1:]) if given else ("--help", [])
     if NUMBA_SETTINGS.exists():
         raise InputError(f"{NUMBA_SETTINGS}: numba would obey this file; start from another folder")
-    if command in ("-h", "--help", "--version"):
-        print(f"mvest {__version__}" if command == "--version" else _help())
+    if name in ("-h", "--help", "--version"):
+        print(f"mvest {mvest.__version__}" if name == "--version" else _help())
         return 0
-    if command not in COMMANDS:
-        close = difflib.get_close_matches(command, COMMANDS, n=1)
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(COMMANDS)}"
-        raise ConfigurationError(f"{command}: no such command; {hint}")
-    _, run = COMMANDS[command]
-    return int(pkgutil.resolve_name(run)(rest)) if isinstance(run, str) else run(rest)
+        raise ConfigurationError(f"{name}: no such command; {hint}")
+    command = COMMANDS[name]
+    if isinstance(command.run, str):
+        return int(pkgutil.resolve_name(command.run)(rest))
+    return command.run(command.parser(name).parse_intermixed_args(rest))
 
 
 def _help() -> str:
     about = "Leaflet stiffness of a mitral valve, from how the valve is seen to close."
-    lines = [f"  mvest {name:<10} {text}" for name, (text, _) in COMMANDS.items()]
-    more = "mvest COMMAND --help says more of each; mvest --version says which one this is."
+    lines = [f"  mvest {name:<10} {command.about}" for name, command in COMMANDS.items()]
+    more = "mvest COMMAND --help lists its options and an example; mvest --version the version."
     return "\n".join([about, "", *lines, "", more])
 
 
-def _parsed(command: str, rest: list[str], **arguments: dict[str, Any]) -> Namespace:
-    """The arguments of a command, which are folders unless they say otherwise."""
-    parser = Parser(f"mvest {command}", description=COMMANDS[command][0])
-    for name, how in arguments.items():
-        parser.add_argument(name, **{"type": Path, "metavar": "FOLDER", **how})
-    return parser.parse_args(rest)
-
-
-def _list(rest: list[str]) -> int:
-    _parsed("list", rest)
-    print(listing(experiments_in(EXPERIMENTS), shutil.get_terminal_size().columns))
+def _list(_: Namespace) -> int:
+    print(listing(experiments_in(EXPERIMENTS)))
     return 0
 
 
-def _tables(rest: list[str]) -> int:
+def _tables(parsed: Namespace) -> int:
     from experiments.results.published import regenerate
 
-    results = _parsed("tables", rest, folder={"nargs": "?", "default": "results"}).folder
-    print(*regenerate(results), sep="\n")
+    print(*regenerate(parsed.folder), sep="\n")
     return 0
 
 
-def _table(rest: list[str]) -> int:
+def _table(parsed: Namespace) -> int:
     from experiments.results.estimates import write_estimates
 
-    file = {"metavar": "FILE", "help": "NAME.csv or NAME.parquet"}
-    parsed = _parsed("table", rest, folder={"help": "of runs, or results/"}, target=file)
     print(*write_estimates(parsed.folder, parsed.target), sep="\n")
     return 0
 
 
-def _collect(rest: list[str]) -> int:
+def _collect(parsed: Namespace) -> int:
     from experiments.runner.sweep import collect_sweep
 
-    return collect_sweep(_parsed("collect", rest, folder={}).folder)
+    return collect_sweep(parsed.folder)
 
 
-def _sync(rest: list[str]) -> int:
-    """Bring MLflow to the state of folders of outputs."""
+def _sync(parsed: Namespace) -> int:
     from experiments.runner.tracking import sync
 
-    some = {"nargs": "*", "help": "outputs if none"}
-    folders: list[Path] = _parsed("sync", rest, folders=some).folders or [Path("outputs")]
-    for folder in folders:
+    for folder in parsed.folders:
         if not folder.is_dir():
             raise InputError(f"{folder}: there is no such folder")
-    return max(sync(folder) for folder in folders)
+    return max(map(sync, parsed.folders))
 
 
-def _dashboard(rest: list[str]) -> int:
+def _dashboard(parsed: Namespace) -> int:
     """Serve MLflow's pages until it is interrupted."""
     import webbrowser
 
@@ -116,12 +126,9 @@ def _dashboard(rest: list[str]) -> int:
     from experiments.runner.tracking import last_sweep, serving
     from mvest.quantities import within
 
-    port = {"default": 5000, "type": int, "metavar": "PORT", "help": "5000; 0: a free one"}
-    outputs = {"nargs": "?", "default": "outputs"}
-    parsed = _parsed("dashboard", rest, outputs=outputs, **{"--port": port})
     validated(Annotated[int, within(0, 65_535, "", "ports; 0: a free one")], parsed.port, "--port")
     try:
-        place, page, title = last_sweep(parsed.outputs)
+        place, page, title = last_sweep(parsed.folder)
         with serving(place, parsed.port) as (address, server):
             print(f"{title}: {address}{page}", flush=True)
             webbrowser.open(address + page)
@@ -130,14 +137,11 @@ def _dashboard(rest: list[str]) -> int:
         return 0
 
 
-def _worker(rest: list[str]) -> int:
-    """Run a shard of a sweep; what becomes of its jobs is recorded, and no failure of this."""
+def _worker(parsed: Namespace) -> int:
+    """Run a shard of a sweep; a failing job is recorded and does not fail the worker."""
     from experiments.runner.engine import execute
     from experiments.runner.plan import Plan
 
-    shard = {"default": "1/1", "type": str, "metavar": "I/N", "help": "I from 1 to N"}
-    folder = {"help": "of the sweep, in outputs/"}
-    parsed = _parsed("worker", rest, folder=folder, **{"--shard": shard})
     found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", parsed.shard)
     first, step = (int(found[1]), int(found[2])) if found else (0, 0)
     if not 1 <= first <= step:
@@ -145,30 +149,86 @@ def _worker(rest: list[str]) -> int:
             f"shard {parsed.shard}, expected I/N with I from 1 to N, for example 2/8"
         )
     plan = Plan.read(parsed.folder, look=False)
-    # Every N-th job of the list, whatever is done: no two shards share one.
+    # Every N-th job of the list, done or not: no two shards share one.
     jobs = plan.jobs[first - 1 :: step]
-    ended = [execute(job, plan.written_ns) for job in jobs]
-    failed = sum(not record.converged for record in ended)
+    failed = sum(not execute(job, plan.written_ns).converged for job in jobs)
     print(f"shard {parsed.shard}: {len(jobs)} jobs, {failed} without an estimate")
     return 0
 
 
-def _application(overrides: list[str]) -> int:
-    """Hydra's application, which reads the command line itself."""
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit != resource.RLIM_INFINITY and limit < LEAST_GB * 2**30:
-        raise ConfigurationError(
-            f"address space is limited to {limit / 2**30:.2g} GB (ulimit -v), expected at least "
-            f"{LEAST_GB:g} GB"
-        )
+def _completion(parsed: Namespace) -> int:
+    """Print a completion script with the words of all commands."""
+    cases = []
+    for name, command in COMMANDS.items():
+        words = ["--help", *(one for one in command.arguments if one.startswith("-"))]
+        if name == "run":
+            words += ["-m", *(f"{group}={one}" for group, of in groups().items() for one in of)]
+        if name in ("import", "export"):
+            found = (Path(mvest.__file__).parent / "exchange" / f"{name}ing").glob("*.py")
+            words += [one.stem for one in found if f"def {name}_{one.stem}(" in one.read_text()]
+        words += ["volume"] if name == "simulate" else []
+        words += ["bash", "zsh"] if name == "completion" else []
+        cases.append(f'    {name}) words="{" ".join(words)}" ;;')
+    start = "autoload -U +X bashcompinit && bashcompinit\n" if parsed.shell == "zsh" else ""
+    print(start + SCRIPT.format(commands=" ".join(COMMANDS), cases="\n".join(cases)))
+    return 0
+
+
+SCRIPT = r"""_mvest() {{
+  local words="{commands} --help --version" line=${{COMP_LINE:0:COMP_POINT}}
+  local word=${{line##* }}
+  (( COMP_CWORD > 1 )) && case ${{COMP_WORDS[1]}} in
+{cases}
+  esac
+  COMPREPLY=($(compgen -W "$words" -- "$word"))
+  # bash replaces only what follows the last "=".
+  [[ $word == *=* && $COMP_WORDBREAKS == *=* ]] && COMPREPLY=("${{COMPREPLY[@]#*=}}")
+}}
+complete -o default -F _mvest mvest"""
+
+
+def groups() -> dict[str, list[str]]:
+    """Group of the configuration -> its choices."""
+    folders = [path for path in sorted(CONF.iterdir()) if path.is_dir() and path.name != "hydra"]
+    return {path.name: sorted(one.stem for one in path.glob("*.yaml")) for path in folders}
+
+
+def run_command(words: list[str]) -> int:
+    """``mvest run``: the bare name of an experiment stands for it; the rest is Hydra's."""
+    if {"-h", "--help"} & set(words):
+        print(_run_help())
+        return 0
     from experiments.run import main as application
 
     before = sys.argv
-    sys.argv = ["mvest run", *map(named, overrides)]
+    sys.argv = ["mvest run", *map(named, words)]
     try:
         return application()
     finally:
         sys.argv = before
+
+
+def _run_help() -> str:
+    chosen = dict(re.findall(r"^  - (\w+): (\w+)$", (CONF / "config.yaml").read_text(), re.M))
+    lines = ["usage: mvest run [EXPERIMENT] [GROUP=CHOICE ...] [NAME=VALUE ...] [-m]", ""]
+    lines += [COMMANDS["run"].about, "", "groups and choices (default in brackets):"]
+    for group, choices in groups().items():
+        text = f"{group} [{chosen.get(group, '-')}]: {', '.join(choices)}"
+        lines.append(textwrap.fill(text, WIDTH, initial_indent="  ", subsequent_indent="      "))
+    return "\n".join([*lines, "", *RUN_OPTIONS])
+
+
+RUN_OPTIONS = (
+    "options:",
+    "  -m, --multirun    all combinations of choices separated by commas, as a sweep",
+    "  --cfg job         print all settings and their values, without running",
+    "  dry_run=true      list what would run, and how long it would take",
+    "  check=true        predict how well the moduli could be estimated",
+    "  force=true        run finished jobs again",
+    "  --hydra-help      further options of Hydra",
+    "",
+    "example: mvest run -m experiment=table1 seed=1,2,3 observation.noise_mm=0.1,0.5",
+)
 
 
 def named(word: str) -> str:
@@ -183,106 +243,149 @@ def named(word: str) -> str:
     raise ConfigurationError(f"{word}: no such experiment; {hint}")
 
 
-def _one_file(command: str, metavar: str, experiment: str, setting: str, rest: list[str]) -> int:
-    """An experiment on one file or folder."""
-    shown = f"for example: mvest {command} {EXAMPLES[command]} --check"
-    parser = Parser(f"mvest {command}", description=COMMANDS[command][0], epilog=shown)
-    parser.add_argument("path", type=Path, metavar=metavar)
-    parser.add_argument("--check", action="store_true", help=CHECK)
-    parser.add_argument("overrides", nargs="*", metavar="NAME=VALUE", help=OVERRIDES)
-    parsed = parser.parse_intermixed_args(rest)
-    for override in parsed.overrides:
-        if "=" not in override:
-            parser.error(f"{override}: expected NAME=VALUE; one {metavar} at a time")
-    if metavar == "FOLDER" and parsed.path.is_file():
-        raise InputError(
-            f"{parsed.path}: a file, expected a folder with case.yaml; for a volume over time: "
-            f"mvest volume {parsed.path}"
-        )
-    check = ["check=true"] if parsed.check else []
-    named = [f"experiment={experiment}", f"{setting}={quoted(str(parsed.path))}"]
-    return _application([*named, *check, *parsed.overrides])
+def _one_path(experiment: str, setting: str) -> Callable[[Namespace], int]:
+    """A command that runs an experiment on one file or folder."""
+
+    def run(parsed: Namespace) -> int:
+        for override in parsed.overrides:
+            if "=" not in override:
+                raise ConfigurationError(f"{override}: expected NAME=VALUE; one path at a time")
+        if setting == "case" and parsed.path.is_file():
+            raise InputError(
+                f"{parsed.path}: a file, expected a folder with case.yaml; for a volume over time: "
+                f"mvest volume {parsed.path}"
+            )
+        check = ["check=true"] if parsed.check else []
+        own = [f"experiment={experiment}", f"{setting}={quoted(str(parsed.path))}"]
+        return run_command([*own, *check, *parsed.overrides])
+
+    return run
 
 
 def quoted(text: str) -> str:
-    """Text as Hydra's grammar takes it literally, whatever characters it has."""
+    """Any text as Hydra's grammar takes it literally."""
     doubled = re.sub(r"(\\+)(?='|$)", r"\1\1", text)
     return "'" + doubled.replace("'", r"\'").replace("${", r"\${") + "'"
 
 
 def experiments_in(folder: Path) -> dict[str, str]:
-    """Name and first sentence of every experiment: of its leading comment, or else its title."""
+    """Name of every experiment -> first sentence of its leading comment, or else its title."""
     return {path.stem: _sentence(path) for path in sorted(folder.glob("*.yaml"))}
 
 
 def _sentence(path: Path) -> str:
-    lines = path.read_text(encoding="utf-8").splitlines()
-    comment = []
-    for line in lines:
-        if not line.startswith("#"):
-            break
-        if not line.startswith("# @package"):
-            comment.append(line.lstrip("# "))
-    if found := re.match(r".+?[.?!](?=\s|$)", " ".join(comment)):
+    text = path.read_text(encoding="utf-8")
+    (comment,) = re.findall(r"\A(?:#.*\n)*", text)
+    lines = [line.lstrip("# ") for line in comment.splitlines() if "@package" not in line]
+    if found := re.match(r".+?[.?!](?=\s|$)", " ".join(lines)):
         return found[0]
-    title = next((line for line in lines if line.startswith("title:")), "")
-    return title.removeprefix("title:").strip().strip("'\"")
+    title = re.search(r"^title: *(.*)$", text, re.M)
+    return title[1].strip("'\"") if title else ""
 
 
-def listing(sentences: dict[str, str], width: int) -> str:
-    """Experiments and their sentences in two columns, the second one folded to the width."""
+def listing(sentences: dict[str, str]) -> str:
+    """Experiments and their sentences in two columns."""
     first = max(map(len, sentences), default=0) + 2
-    return "\n".join(
-        textwrap.fill(
-            sentence,
-            max(width, first + 40),
-            initial_indent=name.ljust(first),
-            subsequent_indent=" " * first,
-        )
-        for name, sentence in sentences.items()
-    )
+    form = textwrap.TextWrapper(WIDTH, subsequent_indent=" " * first)
+    return "\n".join(form.fill(name.ljust(first) + text) for name, text in sentences.items())
 
 
-COMMANDS: dict[str, tuple[str, str | Callable[[list[str]], int]]] = {
-    "list": ("the experiments, one sentence each", _list),
-    "run": (
-        "an experiment with Hydra's overrides, -m for a sweep: run experiment=table1 seed=2",
-        lambda rest: _application(rest),
+def _of(metavar: str, help_: str, **more: Any) -> dict[str, Any]:
+    return {"metavar": metavar, "help": help_, **more}
+
+
+CHECK = "only read, check and draw it, in seconds, and predict how well moduli can be estimated"
+SETTINGS = "settings as in `mvest run`, for example seed=2 or imaged.pressure_mmHg=120"
+MORE = {
+    "--check": {"action": "store_true", "help": CHECK},
+    "overrides": _of("NAME=VALUE", SETTINGS, nargs="*", type=str),
+}
+SWEPT = _of("FOLDER", "of the sweep, in outputs/")
+
+COMMANDS: dict[str, Command] = {
+    "list": Command("the experiments, one sentence each", "", _list),
+    "run": Command(
+        "an experiment with Hydra's overrides; with -m a sweep",
+        "table1 seed=2",
+        "experiments.cli.run_command",
     ),
-    "own-valve": (
+    "own-valve": Command(
         "moduli of a valve from a case folder",
-        lambda rest: _one_file("own-valve", "FOLDER", "own_valve", "case", rest),
+        "examples/case --check",
+        _one_path("own_valve", "case"),
+        {"path": _of("FOLDER", "folder with case.yaml"), **MORE},
     ),
-    "volume": (
+    "volume": Command(
         "moduli of a valve from a volume over time (NRRD, MetaImage, NIfTI, Philips DICOM)",
-        lambda rest: _one_file("volume", "FILE", "volume", "volume", rest),
+        "examples/volume.seq.nrrd imaged.pressure_mmHg=120",
+        _one_path("volume", "volume"),
+        {"path": _of("FILE", "volume over time"), **MORE},
     ),
-    "simulate": (
-        "a simulated echo volume and the truth in it: simulate volume OUT.seq.nrrd",
+    "simulate": Command(
+        "a simulated echo volume, and the truth in it",
+        "volume OUT.seq.nrrd",
         "experiments.simulated_volume.simulate_command",
     ),
-    "import": (
-        "a case folder from what another program wrote: import NAME SOURCE CASE",
+    "import": Command(
+        "a case folder from files of another program",
+        "NAME SOURCE CASE",
         "experiments.exchange.import_command",
     ),
-    "export": (
-        "a case or a result for another program: export NAME SOURCE TARGET",
+    "export": Command(
+        "a case or a result for another program",
+        "NAME SOURCE TARGET",
         "experiments.exchange.export_command",
     ),
-    "tables": ("every table, figure and page of results/ again, from the records in it", _tables),
-    "table": (
-        "all estimates of a folder as one table for statistics: table outputs estimates.csv",
+    "tables": Command(
+        "every table, figure and page of results/ again, from the records in it",
+        "results",
+        _tables,
+        {"folder": _of("FOLDER", "of results", nargs="?", default="results")},
+    ),
+    "table": Command(
+        "all estimates of a folder as one table for statistics",
+        "outputs estimates.csv",
         _table,
+        {
+            "folder": _of("FOLDER", "of runs, or results/"),
+            "target": _of("FILE", "NAME.csv or NAME.parquet"),
+        },
     ),
-    "worker": (
-        "a share of a planned sweep's jobs, under any scheduler: worker FOLDER --shard 2/8",
+    "worker": Command(
+        "run a share of a planned sweep's jobs, under any scheduler",
+        "outputs/sweep_noise --shard 2/8",
         _worker,
+        {"folder": SWEPT, "--shard": _of("I/N", "I from 1 to N", default="1/1", type=str)},
     ),
-    "collect": ("what became of the jobs of a sweep that workers ran", _collect),
-    "sync": ("log to MLflow what is on disk and not there: sync outputs", _sync),
-    "dashboard": ("MLflow's pages, on the comparison of the last sweep", _dashboard),
+    "collect": Command(
+        "collect the results of a sweep that workers ran",
+        "outputs/sweep_noise",
+        _collect,
+        {"folder": SWEPT},
+    ),
+    "sync": Command(
+        "log to MLflow what is on disk and not there",
+        "outputs",
+        _sync,
+        {"folders": _of("FOLDER", "of runs", nargs="*", default=[Path("outputs")])},
+    ),
+    "dashboard": Command(
+        "MLflow's pages, on the comparison of the last sweep",
+        "outputs --port 0",
+        _dashboard,
+        {
+            "folder": _of("FOLDER", "of runs", nargs="?", default="outputs"),
+            "--port": _of("PORT", "0: a free one", default=5000, type=int),
+        },
+    ),
+    "completion": Command(
+        'completion of commands: put eval "$(mvest completion bash)" into ~/.bashrc',
+        "bash",
+        _completion,
+        {"shell": {"type": str, "choices": ["bash", "zsh"], "help": "bash or zsh"}},
+    ),
 }
-"""Command -> what it is about, and the function that runs it or, if slow to import, its name."""
+"""The commands in the order of the help."""
 
 
 if __name__ == "__main__":

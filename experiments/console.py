@@ -25,22 +25,16 @@ TRACEBACKS = "HYDRA_FULL_ERROR"
 """Environment variable that turns tracebacks on."""
 
 AGAIN_S = 0.01
-"""Until a signal is sent again that Python has dropped."""
+"""Time after which a signal is sent again that Python has dropped."""
 
 
 class Interruption(KeyboardInterrupt):
-    """A signal stopped this process.
-
-    Parameters
-    ----------
-    number : int
-        Of the signal.
+    """Signal ``number`` stopped this process.
 
     Attributes
     ----------
     status : int
-        Exit status of a command that was stopped by it, as a shell counts: 130 after Ctrl-C, 143
-        after SIGTERM, 129 after SIGHUP.
+        Exit status as a shell counts: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP.
     """
 
     def __init__(self, number: int) -> None:
@@ -50,12 +44,12 @@ class Interruption(KeyboardInterrupt):
 
 @contextmanager
 def raised() -> Iterator[None]:
-    """Raise the first signal that asks to stop as an `Interruption`, where the main thread is.
+    """Raise the first signal that asks to stop as an `Interruption` in the main thread.
 
-    While that is dealt with, another SIGTERM or SIGHUP is no news: schedulers send several. Another
-    Ctrl-C ends the process at once, as a kill would, which leaves nothing half-written either. A
-    signal that is ignored, as ``nohup`` has it, stays so. Python drops what is raised in a weak
-    reference's callback or a ``__del__``; such a signal is sent again.
+    Further SIGTERM and SIGHUP are then ignored, because schedulers send several. A further Ctrl-C
+    ends the process at once; like a kill, it leaves nothing half-written. An ignored signal, as
+    with ``nohup``, stays ignored. Python drops exceptions in a weak reference's callback or a
+    ``__del__``; such a signal is sent again.
     """
     unraisable = sys.unraisablehook
     before = {number: signal.getsignal(number) for number in ASKING}
@@ -89,20 +83,20 @@ def raised() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = unraisable
-        # A stopped process is about to end; until then another signal may come.
+        # A stopped process is about to end; another signal may come until then.
         for number, handler in before.items():
             if not stopped and signal.getsignal(number) is ask:
                 signal.signal(number, handler)
 
 
 def _ignore() -> None:
-    """Let no signal change the exit status of an interpreter that takes itself apart."""
+    """Let no signal change the exit status of an interpreter that shuts down."""
     for number in ASKING:
         signal.signal(number, signal.SIG_IGN)
 
 
 def interruptible(command: Callable[P, int]) -> Callable[P, int]:
-    """A command that returns an exit status, also where it is refused or stopped."""
+    """A command that returns an exit status, also if it is refused or stopped."""
 
     @functools.wraps(command)
     def stopped(*given: P.args, **named: P.kwargs) -> int:
@@ -112,7 +106,7 @@ def interruptible(command: Callable[P, int]) -> Callable[P, int]:
                 sys.stdout.flush()
                 return status
             except BrokenPipeError:
-                # Whoever reads the output has seen enough, as `head` does.
+                # The reader of the output has closed it, as `head` does.
                 with suppress(OSError):
                     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 return 128 + signal.SIGPIPE
@@ -129,9 +123,22 @@ def interruptible(command: Callable[P, int]) -> Callable[P, int]:
     return stopped
 
 
+class _Form(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Help with defaults, and descriptions as they are written."""
+
+
 class Parser(argparse.ArgumentParser):
-    """A parser of a command's words that refuses wrong ones in one line."""
+    """A parser of a command's words that refuses wrong ones in one line.
+
+    ``example`` is shown at the end of the help.
+    """
+
+    def __init__(self, command: str, about: str, example: str, usage: str | None = None) -> None:
+        shown = f"example: {example}"
+        super().__init__(
+            command, description=about, epilog=shown, usage=usage, formatter_class=_Form
+        )
 
     def error(self, message: str) -> NoReturn:
-        """Print it and leave with status 2."""
+        """Print it and exit with status 2."""
         self.exit(2, f"error: {message}\n")

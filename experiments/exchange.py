@@ -1,8 +1,8 @@
-"""``mvest import`` and ``mvest export``: other programs' files to a case, and from one.
+"""``mvest import`` and ``mvest export``: a case from files of other programs, and for them.
 
-Importers and exporters are found in `mvest.exchange.importing` and `mvest.exchange.exporting`: the
-functions ``import_MODULE`` and ``export_MODULE``, whose last argument is a frozen dataclass of
-options. Nothing is listed here.
+Importers and exporters are the functions ``import_MODULE`` and ``export_MODULE`` in the modules of
+`mvest.exchange.importing` and `mvest.exchange.exporting`. Their last argument is a frozen dataclass
+of options. They need no registration.
 """
 
 from __future__ import annotations
@@ -10,24 +10,29 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import textwrap
 import typing
-from argparse import RawDescriptionHelpFormatter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.common.schema import from_words
+from experiments.common.progress import WIDTH
+from experiments.common.schema import defaults_of, from_words
 from experiments.console import Parser
 from mvest.cases.folder import require_new, write_case
 from mvest.exchange import exporting, importing
+
+EXAMPLES = {
+    "import": "mvest import leaflets valve.stl CASE units=mm tips=[x,y,z,x,y,z]",
+    "export": "mvest export slicer CASE FOLDER",
+}
 
 
 def import_command(given: Sequence[str]) -> int:
     """``mvest import NAME SOURCE CASE [OPTION=VALUE ...]``: write a case folder; exit status."""
     convert, source, target, options = _parsed("import", importing, "CASE", given)
-    # Reading may take a minute.
-    require_new(target)
+    require_new(target)  # before a minute of reading
     case = convert(source, options)
     write_case(target, case)
     print(case, *(f"* {sentence}" for sentence in case.derived), sep="\n")
@@ -53,16 +58,18 @@ def _parsed(
             found[one.name] = function, (module.__doc__ or "").partition("\n")[0]
     name = given[0] if given else "--help"
     if name not in found:
-        parser = Parser(f"mvest {verb}", formatter_class=RawDescriptionHelpFormatter)
-        parser.usage = f"mvest {verb} NAME SOURCE {metavar} [OPTION=VALUE ...]"
-        parser.description = "\n".join(f"  {key:<12} {text}" for key, (_, text) in found.items())
+        form = textwrap.TextWrapper(WIDTH, initial_indent="  ", subsequent_indent=" " * 15)
+        names = "\n".join(form.fill(f"{key:<12} {text}") for key, (_, text) in found.items())
+        more = f"mvest {verb} NAME --help lists the options of each."
+        usage = f"mvest {verb} NAME SOURCE {metavar} [OPTION=VALUE ...]"
+        parser = Parser(f"mvest {verb}", f"{names}\n\n{more}", EXAMPLES[verb], usage)
         if name.startswith("-"):
             parser.parse_args(["--help"])
         parser.error(f"{name}: nothing to {verb} by this name; known: {', '.join(found)}")
     convert, _ = found[name]
     kind: Any = typing.get_type_hints(convert)["options"]
-    parser = Parser(f"mvest {verb} {name}", formatter_class=RawDescriptionHelpFormatter)
-    parser.description = "\n\n".join(filter(None, map(inspect.getdoc, (convert, kind))))
+    about = [inspect.getdoc(convert), inspect.getdoc(kind), defaults_of(kind)]
+    parser = Parser(f"mvest {verb} {name}", "\n\n".join(filter(None, about)), EXAMPLES[verb])
     parser.add_argument("source", type=Path, metavar="SOURCE")
     parser.add_argument("target", type=Path, metavar=metavar)
     parser.add_argument("options", nargs="*", metavar="OPTION=VALUE")

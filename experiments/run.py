@@ -1,4 +1,4 @@
-"""The one application: ``python -m experiments.run experiment=NAME [overrides] [--multirun]``.
+"""The application behind ``mvest run experiment=NAME [overrides] [--multirun]``.
 
 Exit status: 0 done; 1 a run, or a job of a sweep, found no estimate (it is recorded, with its
 reason); 2 the request is wrong (one line says how) or nothing can be written; 130, 143 or 129
@@ -25,8 +25,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from experiments.common.config import register
+from experiments.common.config import hash_of, plain, register
 from experiments.common.places import CONF
+from experiments.common.progress import wrapped
 from experiments.console import TRACEBACKS, interruptible
 from experiments.runner.jobs import RESULT, FailedRunError, Request, nothing_empty
 from experiments.runner.plugins import FailedSweepError, register_plugins
@@ -36,7 +37,7 @@ PRIMARY = "In 'config': "
 """How Hydra begins messages about the primary configuration."""
 
 RESOLVING = "ConfigurationError raised while resolving interpolation: "
-"""How OmegaConf begins messages about what a resolver of ours refuses."""
+"""How OmegaConf begins messages about an error in one of our resolvers."""
 
 
 @interruptible
@@ -51,13 +52,13 @@ def main() -> int:
         except (MvestError, FailedRunError) as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
-            # Hydra would print lines of its own first.
+            # Raised below: Hydra would print further lines first.
             ended.append(error)
             return math.nan
 
     register()
     register_plugins()
-    # Hydra then lets exceptions through, so that they become one line here.
+    # Hydra then passes exceptions on, which become one line here.
     os.environ[TRACEBACKS] = "1"
     try:
         _require_options(sys.argv[1:])
@@ -70,7 +71,7 @@ def main() -> int:
         print(f"no estimate: {error}", file=sys.stderr)
         return 1
     except Exception as error:
-        if wants_tracebacks or not _is_hydra_s(error):
+        if wants_tracebacks or not _from_hydra(error):
             raise
         raise ConfigurationError(explain(error)) from error
     finally:
@@ -80,9 +81,7 @@ def main() -> int:
 
 
 def run_alone(config: DictConfig) -> float:
-    """One run by itself: plan or check it, if nothing else is requested; otherwise run and log it.
-
-    Returns its objective; NaN where there is none.
+    """One single run: plan, check, or run and log it; returns its objective, or NaN.
 
     Raises
     ------
@@ -91,30 +90,32 @@ def run_alone(config: DictConfig) -> float:
     FailedRunError
         If the computation found no estimate; the run is recorded all the same.
     """
-    # Takes seconds to import, which `--help` must not.
-    from experiments.results.published import publish_runs
-    from experiments.runner.compared import metrics
-    from experiments.runner.job import require_admissible, require_checks, run_job
+    # Their import takes seconds, which `--help` must not.
+    from experiments.results.published import publish_as, publish_runs
+    from experiments.runner.job import check_of, require_admissible, run_job
+    from experiments.runner.metrics import metrics
     from experiments.runner.plan import Plan, earlier
     from experiments.runner.tracking import log_run
 
-    with nothing_empty(Path(HydraConfig.get().runtime.output_dir), Path(config.paths.outputs)):
-        request = Request.of(config)
-        values, folder = request.values, request.folder
+    hydra_config = HydraConfig.get()
+    folder = Path(hydra_config.runtime.output_dir)
+    with nothing_empty(folder, Path(config.paths.outputs)):
+        values, overrides = plain(config), tuple(hydra_config.overrides.task)
+        published = publish_as(values, overrides, None)
+        request = Request(values, hash_of(values), folder, published, overrides)
         require_admissible(values)
         if config.dry_run:
             plan = Plan(str(values["name"]), folder.parent, {}, (request,), earlier([request]))
-            print(plan.summary(), plan.listing(), sep="\n")
+            print(wrapped(f"{plan.summary()}\n{plan.listing()}"))
             return math.nan
         if config.check:
-            for check in require_checks(values):
-                print(check(values, folder), flush=True)
+            print(wrapped(check_of(values)(values, folder)), flush=True)
             return math.nan
         record = run_job(request)
         results = Path(values["paths"]["results"])
-        if values["publish"] and not values["sweep"] and not request.publish_as:
+        if values["publish"] and not values["sweep"] and not published:
             print(f"{results} left as it is: this run has overrides")
-        publish_runs([(request.publish_as, record, folder, results)])
+        publish_runs([(published, record, folder, results)])
         log_run(folder, values)
         if not record.converged:
             detail = f" ({record.detail})" if record.detail else ""
@@ -123,7 +124,7 @@ def run_alone(config: DictConfig) -> float:
 
 
 def _require_options(arguments: Sequence[str]) -> None:
-    """Refuse an option that Hydra does not have; it would complete or explain it at length."""
+    """Refuse an unknown option in one line; Hydra would complete it or explain it at length."""
 
     def refuse(message: str) -> NoReturn:
         raise ConfigurationError(f"{message}; settings are NAME=VALUE, as in experiment=debug")
@@ -133,7 +134,7 @@ def _require_options(arguments: Sequence[str]) -> None:
     parser.parse_args(arguments)
 
 
-def _is_hydra_s(error: Exception) -> bool:
+def _from_hydra(error: Exception) -> bool:
     if isinstance(error, HydraException | OmegaConfBaseException):
         return True
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
@@ -142,7 +143,7 @@ def _is_hydra_s(error: Exception) -> bool:
 
 
 def explain(error: BaseException) -> str:
-    """One line: what is wrong and, if known, what would be right."""
+    """One line about an error: what is wrong and, if known, what would be right."""
     own = [line.strip() for line in str(error).splitlines() if line.strip()]
     if not isinstance(error, HydraException | OmegaConfBaseException):
         return f"{' '.join(sys.argv[1:])}: {own[0] if own else type(error).__name__}"
@@ -174,7 +175,7 @@ def explain(error: BaseException) -> str:
 
 
 def _nearest(error: BaseException) -> str:
-    """The setting that a misspelt one was probably meant to be."""
+    """A hint at the setting with the most similar name."""
     key, parent = getattr(error, "key", None), getattr(error, "parent_node", None)
     if key is None or not isinstance(parent, DictConfig) or key in parent:
         return ""

@@ -1,10 +1,10 @@
-"""``mvest simulate volume``: a simulated echo volume over time and, beside it, what is true."""
+"""``mvest simulate volume``: a simulated echo volume over time, and its truth next to it."""
 
 from __future__ import annotations
 
+import inspect
 import json
 import time
-from argparse import RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +17,12 @@ from hydra.errors import HydraException
 from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.config import plain, register
 from experiments.common.places import CONF
-from experiments.common.progress import PartBar, announce_compilation
-from experiments.common.schema import from_words
+from experiments.common.progress import PartBar
+from experiments.common.schema import defaults_of, from_words
 from experiments.console import Parser
 from mvest.cases.from_images.measures import write_landmarks, write_surfaces
 from mvest.errors import ConfigurationError
-from mvest.exchange.segmentations import checked_path, write_sequence_nrrd
+from mvest.exchange.volumes import sequence_path, write_sequence_nrrd
 from mvest.files import write_atomically
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
@@ -37,7 +37,7 @@ CONFIGURED = ("valve", "mechanics")
 
 @dataclass(frozen=True, slots=True)
 class SimulatedVolumeOptions:
-    """What is imaged, and how.
+    """The valve and its image.
 
     Attributes
     ----------
@@ -64,37 +64,39 @@ class SimulatedVolumeOptions:
 
 def simulate_command(given: Sequence[str]) -> int:
     """``mvest simulate volume OUT.seq.nrrd [NAME=VALUE ...]``; exit status."""
-    about = (SimulatedVolumeOptions.__doc__ or "").partition("\n")[2]
-    parser = Parser(
-        "mvest simulate",
-        description=f"{__doc__}\n\nvalve=NAME and mechanics... as in `mvest run`, and:\n{about}",
-        formatter_class=RawDescriptionHelpFormatter,
-    )
+    about = [
+        f"{__doc__}\n\nvalve=NAME and mechanics... as in `mvest run`, and:",
+        inspect.getdoc(SimulatedVolumeOptions) or "",
+        defaults_of(SimulatedVolumeOptions),
+    ]
+    example = "mvest simulate volume mine.seq.nrrd valve=prolapse moduli=[5,1.8] seed=7"
+    parser = Parser("mvest simulate", "\n\n".join(about), example)
     parser.add_argument("what", choices=["volume"])
-    parser.add_argument("target", type=Path, metavar="OUT", help=f"ends in {SUFFIX}")
+    parser.add_argument("target", type=Path, metavar="OUT", help=f"file that ends in {SUFFIX}")
     parser.add_argument("options", nargs="*", metavar="NAME=VALUE")
     parsed = parser.parse_intermixed_args(list(given))
     began = time.monotonic()
     volume, truth = write_simulated_volume(parsed.target, parsed.options)
     print(
         f"wrote {volume}: a simulated volume, of nobody, in {time.monotonic() - began:.1f} s\n"
-        f"what is true in it: {truth}\nnext: mvest volume {volume} --check"
+        f"its truth: {truth}\nnext: mvest volume {volume} --check"
     )
     return 0
 
 
 def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Path]:
-    """Simulate a volume as words NAME=VALUE say and write it; the paths of volume and truth.
+    """Simulate a volume and write it; returns the paths of volume and truth.
 
-    Beside ``NAME.seq.nrrd``, the folder ``NAME_truth`` has ``truth.json``, the surfaces of all
-    frames and the landmarks of the open and the closed one. No estimate reads it.
+    ``words`` are options NAME=VALUE. Next to ``NAME.seq.nrrd``, the folder ``NAME_truth`` has
+    ``truth.json``, the surfaces of all frames, and the landmarks of the open and the closed frame.
+    No estimate reads it.
 
     Raises
     ------
     MvestError
         An unknown name, an inadmissible value, or a valve that does not close.
     """
-    checked_path(target, SUFFIX)
+    sequence_path(target)
     configured = [word for word in words if word.partition("=")[0].split(".")[0] in CONFIGURED]
     own = [word for word in words if word not in configured]
     options = from_words("simulate", SimulatedVolumeOptions, own, CONFIGURED)
@@ -113,7 +115,6 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
         distance_mm=options.distance_mm,
         tilt_deg=options.tilt_deg,
     )
-    announce_compilation("the simulation")
     with PartBar("closure of the valve", 1, "closure") as bar:
         valve = close_in_motion(DrawnValve("simulated", template, moduli, mechanics), motion)
         bar.step()

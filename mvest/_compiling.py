@@ -1,12 +1,19 @@
-"""The folder of numba's cache."""
+"""Where numba caches compiled kernels, and a note when it compiles."""
 
 import os
 import stat
+import sys
 from contextlib import suppress
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
 """Environment variable that names the folder."""
+
+KIND = "numba:compile"
+"""What numba calls the event; a kernel that is loaded from the cache causes none."""
+
+NOTE = "compiling numerical kernels; this takes up to a minute, once after an installation"
+"""Line of `announce_compilation`."""
 
 
 def choose_cache() -> None:
@@ -42,3 +49,18 @@ def _private_folder() -> Path:
     if private and found.st_uid == os.getuid():
         return folder
     return Path(tempfile.mkdtemp(prefix="mvest-numba-"))
+
+
+def announce_compilation() -> None:
+    """Say in one line when numba first compiles something in this process: it takes a while."""
+    from numba.core import event
+
+    class Announcement(event.Listener):
+        def on_start(self, _: object) -> None:
+            event.unregister(KIND, self)  # type: ignore[no-untyped-call]
+            print(NOTE, file=sys.stderr, flush=True)
+
+        def on_end(self, _: object) -> None:
+            pass
+
+    event.register(KIND, Announcement())  # type: ignore[no-untyped-call]

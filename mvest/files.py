@@ -6,7 +6,6 @@ import hashlib
 import os
 import shutil
 import stat
-import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -32,8 +31,8 @@ def write_atomically(
     path : Path or str
         Its folder must exist.
     content : str, bytes or callable
-        Text is written as UTF-8, with a ? (and a note) for characters without UTF-8. A callable
-        gets the temporary path, which ends as ``path`` does, and makes a file or a folder there.
+        Text is written as UTF-8, with a ? for what has none. A callable gets the temporary path,
+        which ends as ``path`` does, and makes a file or a folder there.
     sync : bool
         Whether to flush the content to the disk before renaming.
 
@@ -54,7 +53,9 @@ def write_atomically(
             if callable(content):
                 content(part)
             else:
-                part.write_bytes(_encoded(content, target) if isinstance(content, str) else content)
+                if isinstance(content, str):
+                    content = content.encode(errors="replace")
+                part.write_bytes(content)
             for file in filter(Path.is_file, [part, *part.rglob("*")]) if sync else ():
                 with file.open("rb+") as stream:
                     os.fsync(stream.fileno())
@@ -128,16 +129,6 @@ def _remembered(file: Path, key: tuple[int, ...]) -> str:
 def _digest(file: Path) -> str:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _encoded(text: str, target: Path) -> bytes:
-    """UTF-8, with a ? and a note for characters without it."""
-    try:
-        return text.encode()
-    except UnicodeEncodeError as error:
-        code = f"U+{ord(text[error.start]):04X}"
-        print(f"note: {target}: {code} cannot be written and is a ? there", file=sys.stderr)
-        return text.encode(errors="replace")
 
 
 def remove_parts(folder: Path, name: str = "") -> None:

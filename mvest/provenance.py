@@ -41,9 +41,13 @@ def provenance(directory: Path | None = None) -> dict[str, Any]:
         ``git`` (see `git_state`), ``versions`` of packages and ``threads`` by environment variable
         (None if not installed or unset), ``python``, ``platform``, ``machine`` and ``cpu_count``.
     """
+    versions: dict[str, str | None] = dict.fromkeys(KEY_PACKAGES)
+    for name in KEY_PACKAGES:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
     return {
         "git": git_state(directory or Path(__file__).resolve().parent),
-        "versions": {name: _version(name) for name in KEY_PACKAGES},
+        "versions": versions,
         "threads": {name: os.environ.get(name) for name in THREAD_VARIABLES},
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -80,25 +84,15 @@ def _git(directory: Path, *arguments: str) -> str | None:
     return None
 
 
-def _version(name: str) -> str | None:
-    with suppress(importlib.metadata.PackageNotFoundError):
-        return importlib.metadata.version(name)
-    return None
-
-
-def canonical_json(value: Any) -> str:
-    """ASCII JSON with sorted keys; equal data give equal texts, but 1 and 1.0 do not.
-
-    Tuples and NumPy values are written as plain data, and paths as text. A value without a JSON
-    form, such as NaN, is an InputError.
-    """
-    plain = _plain(value, "value")
-    return json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
-
-
 def config_hash(config: Mapping[str, Any]) -> str:
-    """SHA-256 (64 hexadecimal digits) of the `canonical_json` of a configuration."""
-    return hashlib.sha256(canonical_json(config).encode("ascii")).hexdigest()
+    """SHA-256 (64 hexadecimal digits) of a configuration as ASCII JSON with sorted keys.
+
+    Tuples and NumPy values count as plain data, and paths as text; 1 and 1.0 differ. A value
+    without a JSON form, such as NaN, is an InputError.
+    """
+    plain = _plain(config, "value")
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -1,7 +1,6 @@
-"""A case whose closure is a formula: what surrounds a closure is tested in milliseconds with it.
+"""A case whose closure is a formula, for fast tests of everything around a closure.
 
-Every unknown moves the leaflets by a smooth field of its own, pressure over stiffness as a belly.
-It says nothing about valves.
+Every unknown moves the leaflets by a smooth field, pressure over stiffness as a belly.
 """
 
 from __future__ import annotations
@@ -131,18 +130,21 @@ class MadeUpClosure:
     def _values(self, m: np.ndarray) -> dict[str, float]:
         return {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
 
+    def _jacobian(self, m: np.ndarray, pressure: float) -> np.ndarray:
+        columns = []
+        for k in range(len(m)):
+            # The formula is smooth: central differences are exact to nine digits.
+            h = 1e-5 * m[k] * np.eye(len(m))[k]
+            up, down = (shape(self._values(m + step), pressure) for step in (h, -h))
+            columns.append(((up - down) / (2 * h[k])).ravel())
+        return np.stack(columns, axis=1)
+
     def __call__(self, m: np.ndarray) -> Prediction:
         self.calls.append(np.array(m))
         values = self._values(m)
         if values["E_f.anterior"] > self.fails_above:
             return Prediction.failed("no equilibrium")
-        columns = []
-        for k in range(len(m)):
-            # The formula is smooth: central differences are exact to nine digits.
-            h = 1e-5 * m[k] * np.eye(len(m))[k]
-            up, down = shape(self._values(m + h)), shape(self._values(m - h))
-            columns.append(((up - down) / (2 * h[k])).ravel())
-        jacobian = np.stack(columns, axis=1)
+        jacobian = self._jacobian(m, PRESSURE)
         rest = VALVE.surface.vertices
         return Prediction(
             np.concatenate([rest.ravel(), shape(values).ravel()]),
@@ -159,13 +161,8 @@ class MadeUpClosure:
         for state in states:
             self.states.append(state)
             lift = np.tile((state.annulus - CLOSED_ANNULUS).mean(axis=0), (len(BASE), 1))
-            columns = []
-            for k in range(len(m)):
-                h = 1e-5 * m[k] * np.eye(len(m))[k]
-                two = [shape(self._values(m + s * h), state.pressure_mmHg) for s in (1, -1)]
-                columns.append(((two[0] - two[1]) / (2 * h[k])).ravel())
             at = shape(self._values(m), state.pressure_mmHg) + lift
-            parts.append(Prediction(at.ravel(), np.stack(columns, axis=1)))
+            parts.append(Prediction(at.ravel(), self._jacobian(m, state.pressure_mmHg)))
         return parts
 
     def held(self, m: np.ndarray, states: Sequence[HeldState]) -> list[np.ndarray | None]:

@@ -22,6 +22,7 @@ from experiments.common.study import study_names
 from tests.places import ROOT
 
 LEAVES = (
+    "mvest._compiling",
     "mvest.errors",
     "mvest.files",
     "mvest.cache",
@@ -41,7 +42,6 @@ VALUE_OBJECTS = (
 FILES = (
     "mvest.exchange.surfaces",
     "mvest.exchange.volumes",
-    "mvest.exchange.segmentations",
     "mvest.exchange.markups",
 )
 """Of the exchange of files, what cases are read by."""
@@ -151,7 +151,7 @@ RUNNER = "experiments.runner"
 ORDINARY_WORDS = {"case", "volume", "gate", "closure", "external", "filters", "patient"}
 """Names of studies that are also parts of a configuration, or words."""
 RUNNER_ROOMS = (
-    "jobs", "plan", "compose", "compared", "tracking", "cluster", "engine", "job",
+    "jobs", "plan", "compose", "metrics", "tracking", "cluster", "engine", "job",
 )  # fmt: skip
 """In the runner a module imports none that comes after it; one that is not listed comes last."""
 

@@ -1,12 +1,12 @@
 """The schema of every configuration, registered with Hydra.
 
-What the library names is taken from the library (`experiments.common.schema`); what a study adds is
-its own `Settings`. Everything else is declared here.
+Settings of the library are declared in the library (`experiments.common.schema` converts them), and
+those of a study in its own `Settings`. Everything else is declared here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import PurePath
@@ -107,7 +107,7 @@ class FilterSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """What is seen of the valve, and how it differs from what is there."""
+    """Which frames and points of the valve are observed, and with which errors."""
 
     frames: tuple[str, ...] = ("open", "closed")
     columns: PointsAround = 112
@@ -116,13 +116,13 @@ class Observation:
     noise_mm: Length = 0.0  # SD of independent errors of each coordinate
     correlated_mm: Length = 0.0  # SD of errors that neighbouring vertices share
     correlation_length_mm: Length = 5.0
-    dropout_mm: Length = 0.0  # closed vertices this near to another leaflet are not seen
+    dropout_mm: Length = 0.0  # closed vertices closer than this to another leaflet are lost
     annulus_offset_mm: tuple[Place, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """What the synthetic observation is made from; null means as the estimator's model."""
+    """The model that makes the synthetic observation; null: as in the estimator's model."""
 
     values: tuple[Value, ...] = MISSING
     label: str = MISSING  # what a table calls it
@@ -169,7 +169,7 @@ class Tracking:
 
 @dataclass(frozen=True, kw_only=True)
 class Mechanics(MechanicsSettings):
-    """The mechanics, and what they are computed on."""
+    """The mechanics, their finite element, and the contact points."""
 
     element: str = "hex18"
     reading: str = "A"  # Poisson option of every region
@@ -185,7 +185,7 @@ class Config:
     title: str = MISSING
     row: str = MISSING  # what a table calls this run
     table: str = "${name}"  # which table in results/ it belongs to
-    publish: Switch = False  # whether results take it over if run without overrides
+    publish: Switch = False  # copy the record to results/ if run without overrides
     paper: Paper | None = None
     parameters: tuple[str, ...] = MISSING
     fixed: ByParameter = field(default_factory=dict)
@@ -202,19 +202,19 @@ class Config:
     seed: Seed = 1
     repeats: Repeats = 1  # observations with the seeds seed, seed + 1, ..., each estimated from
     figures: Switch = True  # draw the run; a sweep need not draw every job
-    force: Switch = False  # run again what is done
-    dry_run: Switch = False  # only say what would run, and how long it would take
-    detach: Switch = False  # of a sweep: only plan its jobs, for `mvest worker`
-    # After this a job is stopped and recorded as failed.
+    force: Switch = False  # run finished jobs again
+    dry_run: Switch = False  # only list what would run, and how long it would take
+    detach: Switch = False  # only plan the jobs of a sweep, for `mvest worker`
+    # A job that takes longer is stopped and recorded as failed.
     time_limit_s: Annotated[TimeLimit | None, NOT_HASHED] = None
-    # Beyond this a job fails; null: its part of the machine.
+    # A job that needs more fails; null: an equal share of the machine's memory.
     memory_limit_gb: Annotated[Gigabytes | None, NOT_HASHED] = None
-    # What optimising sweepers compare jobs by: a number of a run, as MLflow names it.
+    # The metric that optimising sweepers minimise, by its name in MLflow.
     objective: Annotated[str, NOT_HASHED] = "error.mean"
     # What is varied in this job, by name.
     factors: Annotated[dict[str, Any], NOT_HASHED] = field(default_factory=dict)
-    # A sweep's name, size, and under the name of each size its grid, or a list of grids of
-    # which it is the union; empty for a run by itself.
+    # A sweep's name, its size, and for each size a grid or a list of grids (their union); empty
+    # for a single run.
     sweep: Annotated[dict[str, Any], NOT_HASHED] = field(default_factory=dict)
     paths: Annotated[Paths, NOT_HASHED] = field(default_factory=Paths)
     tracking: Annotated[Tracking, NOT_HASHED] = field(default_factory=Tracking)
@@ -223,15 +223,12 @@ class Config:
 def plain(config: DictConfig) -> dict[str, Any]:
     """A configuration, without Hydra's part, as resolved plain data.
 
-    Raises
-    ------
-    ConfigurationError
-        If an override has deleted a setting.
+    Raises a `ConfigurationError` if an override has deleted a setting.
     """
     found: dict[str, Any] = {}
     for key in map(str, config):
         if key != "hydra":
-            # Part by part: a copy without the others would take longer than everything else here.
+            # Part by part: a copy without Hydra's part would take longer than all else here.
             value = MISSING if OmegaConf.is_missing(config, key) else config[key]
             is_part = OmegaConf.is_config(value)
             found[key] = OmegaConf.to_container(value, resolve=True) if is_part else value
@@ -244,15 +241,15 @@ def plain(config: DictConfig) -> dict[str, Any]:
 def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
     """SHA-256 of everything in a configuration, resolved or not, that can change the result.
 
-    A file or folder that it names counts by its content, not by its name.
+    A file or folder counts by its content, not by its name.
     """
     values = plain(config) if isinstance(config, DictConfig) else config
-    _require_names(values)  # of the folder, which Hydra makes next
+    _require_names(values)  # Hydra is about to make a folder of this name
     return config_hash(with_contents(_kinds(values.get("study")), values, hashed=True))
 
 
 def is_hashed(key: str, study: str | None) -> bool:
-    """Whether a setting, or what it is part of, can change the result of a study."""
+    """Whether a setting, or the part that holds it, can change the result of a study."""
     kinds = _kinds(study)
     for name in key.split("."):
         kind, marks = parts_of(kinds.get(name, Any))
@@ -263,7 +260,7 @@ def is_hashed(key: str, study: str | None) -> bool:
 
 
 def require_in_range(values: Mapping[str, Any]) -> None:
-    """Refuse a configuration with a number outside its range, or a text that is none.
+    """Refuse a configuration with a number outside its range, or an unusable text.
 
     Parameters
     ----------
@@ -287,7 +284,7 @@ def require_in_range(values: Mapping[str, Any]) -> None:
 
 
 def _require_names(values: Mapping[str, Any]) -> None:
-    """Refuse a name that is none for a file."""
+    """Refuse texts that cannot name a file."""
     names = {key: values.get(key) for key in NAMES}
     names["sweep.name"] = (values.get("sweep") or {}).get("name")
     for key, given in names.items():
@@ -299,7 +296,7 @@ def _require_names(values: Mapping[str, Any]) -> None:
 
 
 def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration as it is written and given away: no name of a file or folder of its user.
+    """A configuration without names of the user's files and folders, for writing to disk.
 
     A setting that names a file has its SHA-256 instead; the folders of results are left out.
     """
@@ -309,24 +306,17 @@ def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def _kinds(study: str | None) -> dict[str, Any]:
-    """Setting of a study at the top -> its type."""
+    """Top-level setting of a study -> its type."""
     if study not in study_names():
         return hints_of(Config)
     settings: type = load_study(study).settings
     return {**hints_of(Config), **hints_of(settings)}
 
 
-def _package_model() -> str | None:
-    """SHA-256 of the detectors that come with the package, if there are any."""
-    if not MODEL_FILE.is_file():
-        return None
-    return sha256_of(MODEL_FILE)
-
-
 class Studies(dict[str, Any]):
-    """Hydra's configuration group ``study``: the schema of a study is made when Hydra reads it.
+    """Hydra's configuration group ``study``. A schema is made when Hydra reads it.
 
-    So a job imports its own study only, and a new study needs no registration.
+    So a job imports only its own study, and a new study needs no registration.
     """
 
     def __getitem__(self, file: str) -> ConfigNode:
@@ -337,14 +327,9 @@ class Studies(dict[str, Any]):
         return ConfigNode(file, config, GROUP, "_global_", "mvest")
 
 
-def _valve_folder(*, _root_: DictConfig) -> str | None:
-    """SHA-256 of the case folder whose anatomy is configured, if there is one."""
-    return folder_hash(_root_.valve.folder)
-
-
 def _chosen(group: str, *, _root_: DictConfig) -> str:
-    """What was chosen of a group; its name where that is not known."""
-    # A job of a sweep is composed with Hydra's part, one by itself is not.
+    """The choice of a configuration group; the group's name where it is not known."""
+    # The configuration of a sweep's job includes Hydra's part; that of a single run does not.
     if OmegaConf.select(_root_, "hydra") is not None:
         return str(_root_.hydra.runtime.choices[group])
     known = HydraConfig.initialized()
@@ -352,17 +337,19 @@ def _chosen(group: str, *, _root_: DictConfig) -> str:
 
 
 def register() -> None:
-    """Make the schemas and the resolvers known; may be called again.
+    """Register the schemas and resolvers; may be called again.
 
     ``${config_hash:}`` is the hash of the configuration, ``${package_model:}`` that of the
-    package's detectors, ``${chosen:GROUP}`` what was chosen of a group,
-    ``${valve_folder:}`` the hash of the case whose anatomy is configured.
+    package's detectors, ``${chosen:GROUP}`` the choice of a group, and ``${valve_folder:}`` the
+    hash of the case whose anatomy is configured.
     """
     studies = Studies.fromkeys(f"{name}.yaml" for name in study_names())
     ConfigStore.instance().repo[GROUP] = studies
-    OmegaConf.register_new_resolver("package_model", _package_model, replace=True)
-    OmegaConf.register_new_resolver("valve_folder", _valve_folder, replace=True)
-    OmegaConf.register_new_resolver("chosen", _chosen, replace=True)
-    OmegaConf.register_new_resolver(
-        "config_hash", lambda *, _root_: hash_of(_root_)[:16], replace=True
-    )
+    resolvers: dict[str, Callable[..., str | None]] = {
+        "package_model": lambda: sha256_of(MODEL_FILE) if MODEL_FILE.is_file() else None,
+        "valve_folder": lambda *, _root_: folder_hash(_root_.valve.folder),
+        "chosen": _chosen,
+        "config_hash": lambda *, _root_: hash_of(_root_)[:16],
+    }
+    for name, resolver in resolvers.items():
+        OmegaConf.register_new_resolver(name, resolver, replace=True)

@@ -1,7 +1,7 @@
-"""Configuration schemas made from frozen dataclasses of the library and the studies, and back.
+"""Hydra schemas made from frozen dataclasses of the library and the studies, and back.
 
-A setting has one name, one type, one default and one range, and all of them stand where it is
-declared. A misspelt, wrongly typed or inadmissible override is refused before anything is built.
+A setting has one name, type, default and range, all given where it is declared. A misspelt, wrongly
+typed or inadmissible override is refused before anything is built.
 """
 
 from __future__ import annotations
@@ -28,30 +28,29 @@ T = TypeVar("T")
 Values: TypeAlias = Mapping[str, Any]
 """Plain data of a configuration, or of a part of it."""
 
-MAX_ENTRIES, MAX_LETTERS = 10_000, 10_000
-"""Of a list or mapping, and of a text."""
+MAX_LETTERS = 10_000
+"""Longest text of a setting."""
 
 LARGEST = 1e15
-"""Of a number whose type has no range: a sweep's factor, a setting of another program."""
+"""Largest number of a setting whose type has no range."""
+
+NOT_HASHED = "not hashed"
+"""Marks a setting that changes no number of a result; it is left out of the hash."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Reads:
     """Marks a setting that names files or folders which the study reads.
 
-    In the hash of a configuration what lies there stands in place of its name.
+    The hash of a configuration uses their content, not their names.
 
     Attributes
     ----------
     contents : callable
-        (value of the setting, values beside it) -> plain data that say what will be read.
+        (value of the setting, its neighbouring values) -> plain data that identify the content.
     """
 
-    contents: Callable[[Any, Mapping[str, Any]], Any]
-
-
-NOT_HASHED = "not hashed"
-"""Marks a setting that changes no number of a result, and stays out of its hash."""
+    contents: Callable[[Any, Values], Any]
 
 
 def _in_their_ranges(values: dict[str, float]) -> dict[str, float]:
@@ -62,11 +61,11 @@ def _in_their_ranges(values: dict[str, float]) -> dict[str, float]:
 
 
 BY_PARAMETER = AfterValidator(_in_their_ranges)
-"""Marks values by parameter; each must be in the range of its parameter."""
+"""Marks a mapping from parameters to values; each value must be in its parameter's range."""
 
 
 def contents(value: Any, _beside: Values | None = None) -> Any:
-    """Plain data with the content of each named file in place of its name, if it can be read."""
+    """Plain data in which the SHA-256 of each readable file replaces its name."""
     if isinstance(value, Mapping):
         return {key: contents(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -74,8 +73,7 @@ def contents(value: Any, _beside: Values | None = None) -> Any:
     try:
         return {"sha256": sha256_of(Path(value))} if isinstance(value, str | Path) else value
     except ValueError:
-        # The study says what is wrong with it.
-        return str(value)
+        return str(value)  # the study reports what is wrong with it
 
 
 InputFile = Annotated[str | None, Reads(contents)]
@@ -83,14 +81,14 @@ InputFile = Annotated[str | None, Reads(contents)]
 
 
 def with_contents(kinds: Mapping[str, Any], values: Values, *, hashed: bool) -> dict[str, Any]:
-    """Values with the content of the files that they name, and equal numbers equal.
+    """Values with file contents in place of names, and whole numbers as ints.
 
     Parameters
     ----------
     kinds : mapping
         Setting -> its type with its marks.
     values : mapping
-        Plain data. Whole numbers become ints, so that 1 and 1.0 are one setting in a hash.
+        Plain data. 1 and 1.0 become one setting in a hash.
     hashed : bool
         Whether settings that change no result are left out.
     """
@@ -99,12 +97,12 @@ def with_contents(kinds: Mapping[str, Any], values: Values, *, hashed: bool) -> 
         kind, marks = parts_of(kinds.get(name, Any))
         if hashed and NOT_HASHED in marks:
             continue
-        reads = [mark for mark in marks if isinstance(mark, Reads)]
-        if reads and value not in (None, MISSING):
-            value = reads[0].contents(value, values)
+        for mark in marks:
+            if isinstance(mark, Reads) and value not in (None, MISSING):
+                value = mark.contents(value, values)
         inner = kinds_in(kind, value) if isinstance(value, Mapping) else {}
-        # Within a mapping by any names every setting counts.
-        within = hashed and _is_schema(kind)
+        # Marks count in dataclasses only; in a mapping by name every setting is hashed.
+        within = hashed and dataclasses.is_dataclass(kind)
         found[name] = with_contents(inner, value, hashed=within) if inner else _whole(value)
     return found
 
@@ -113,8 +111,8 @@ def parts_of(kind: Any) -> tuple[Any, tuple[Any, ...]]:
     """The type of a setting without None, and its marks."""
     marks: tuple[Any, ...] = ()
     if typing.get_origin(kind) is Annotated:
-        kind, *marks_ = typing.get_args(kind)
-        marks = tuple(marks_)
+        kind, *rest = typing.get_args(kind)
+        marks = tuple(rest)
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
         kind = next(one for one in typing.get_args(kind) if one is not types.NoneType)
     return kind, marks
@@ -122,8 +120,8 @@ def parts_of(kind: Any) -> tuple[Any, tuple[Any, ...]]:
 
 def kinds_in(kind: Any, names: Iterable[str]) -> dict[str, Any]:
     """Setting -> type within a dataclass, or within a mapping that has these names."""
-    if _is_schema(kind):
-        return hints_of(kind)
+    if dataclasses.is_dataclass(kind):
+        return hints_of(typing.cast(type, kind))
     is_mapping = typing.get_origin(kind) in (dict, Mapping)
     return dict.fromkeys(names, typing.get_args(kind)[1]) if is_mapping else {}
 
@@ -137,23 +135,18 @@ def _whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _is_schema(kind: Any) -> bool:
-    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
-
-
 @cache
 def hints_of(cls: type) -> dict[str, Any]:
     """Types of the fields of a dataclass, with their marks."""
-    names = {field.name for field in dataclasses.fields(cls)}
     hints = typing.get_type_hints(cls, include_extras=True)
-    return {name: hint for name, hint in hints.items() if name in names}
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
 _adapter = cache(TypeAdapter)
 
 
 def validated(kind: Any, value: Any, key: str = "") -> Any:
-    """A value of a type from plain data; names that a dataclass has not are passed over.
+    """A value of a type from plain data; names that a dataclass does not have are ignored.
 
     Parameters
     ----------
@@ -173,31 +166,28 @@ def validated(kind: Any, value: Any, key: str = "") -> Any:
         first = error.errors(include_url=False)[0]
         own = first.get("ctx", {}).get("error")
         if isinstance(own, MvestError) and not isinstance(own, OutsideError):
-            raise own from error  # of a class itself
+            raise own from error  # raised by a dataclass itself
         *_, last = place = [key, *first["loc"]]
         name = ".".join(part for part in place if isinstance(part, str) and part)
-        given = first["input"]
-        match first["type"]:
-            case _ if own is not None:
-                fault = str(own)
-            case "missing" if isinstance(last, str):
-                fault = " has no value"
-            case _ if given == MISSING:
-                fault = " has no value"
-            case "literal_error":
-                fault = f" = {given!r}, expected {first['ctx']['expected'].replace(chr(39), '')}"
-            case _:
-                fault = f" = {given!r}: {first['msg']}"
-        raise ConfigurationError(f"{name}{fault}") from error
+        given, fault = first["input"], first["type"]
+        if own is not None:
+            text = str(own)
+        elif given == MISSING or (fault == "missing" and isinstance(last, str)):
+            text = " has no value"
+        elif fault == "literal_error":
+            text = f" = {given!r}, expected {first['ctx']['expected'].replace(chr(39), '')}"
+        else:
+            text = f" = {given!r}: {first['msg']}"
+        raise ConfigurationError(f"{name}{text}") from error
 
 
-def build(cls: type[T], values: Mapping[str, Any]) -> T:
-    """The frozen ``cls`` from plain data of its schema (`validated`)."""
+def build(cls: type[T], values: Values) -> T:
+    """The frozen ``cls`` from plain data of its schema (see `validated`)."""
     return typing.cast(T, validated(cls, values))
 
 
 def from_words(command: str, cls: type[T], words: Sequence[str], others: Sequence[str] = ()) -> T:
-    """The frozen ``cls`` from words NAME=VALUE of a command, values as in YAML.
+    """The frozen ``cls`` from words NAME=VALUE of a command, with values as in YAML.
 
     Parameters
     ----------
@@ -205,7 +195,7 @@ def from_words(command: str, cls: type[T], words: Sequence[str], others: Sequenc
     cls : type
     words : sequence of str
     others : sequence of str
-        Names besides its own that the command knows.
+        Further names that the command knows, for the message.
 
     Raises
     ------
@@ -225,8 +215,14 @@ def from_words(command: str, cls: type[T], words: Sequence[str], others: Sequenc
     return build(cls, typing.cast("dict[str, Any]", OmegaConf.to_container(merged)))
 
 
+def defaults_of(cls: type) -> str:
+    """The settings of a frozen dataclass and their defaults, as YAML for a help text."""
+    text = OmegaConf.to_yaml(OmegaConf.structured(schema(cls)))
+    return "Defaults:\n" + "".join(f"  {line}\n" for line in text.splitlines())
+
+
 def require_admissible_values(kind: Any, value: Any, key: str = "") -> None:
-    """Refuse values of a schema with a number outside its range, or a text that is none.
+    """Refuse values of a schema with a number outside its range, or an unusable text.
 
     Raises
     ------
@@ -238,7 +234,7 @@ def require_admissible_values(kind: Any, value: Any, key: str = "") -> None:
 
 
 def _require_plain(value: Any, key: str) -> None:
-    """Refuse plain data of whatever type that no setting has."""
+    """Refuse missing values, texts with control characters, and numbers that are not finite."""
     if value == MISSING:
         raise ConfigurationError(f"{key} has no value")
     if isinstance(value, str):
@@ -247,10 +243,6 @@ def _require_plain(value: Any, key: str) -> None:
         except InputError as error:
             raise ConfigurationError(f"{key} has {error}") from error
     elif isinstance(value, Mapping | list | tuple):
-        if len(value) > MAX_ENTRIES:
-            raise ConfigurationError(
-                f"{key} has {len(value)} entries, expected at most {MAX_ENTRIES}"
-            )
         named = value.items() if isinstance(value, Mapping) else (("", part) for part in value)
         for name, part in named:
             _require_plain(part, ".".join(filter(None, (key, str(name)))))
@@ -264,7 +256,7 @@ def _require_plain(value: Any, key: str) -> None:
 def schema(*classes: type) -> type:
     """A mutable dataclass that OmegaConf accepts, with the fields of frozen dataclasses.
 
-    Tuples become lists, nested dataclasses schemas of their own; defaults stay.
+    Tuples become lists, and nested dataclasses schemas of their own. Defaults are the same.
     """
     fields: dict[str, Any] = {}
     for cls in classes:
@@ -280,7 +272,7 @@ def _default(field: dataclasses.Field[Any], kind: Any) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return _config_value(field.default_factory())
     if field.default is dataclasses.MISSING:
-        return kind() if _is_schema(kind) else MISSING
+        return kind() if isinstance(kind, type) and dataclasses.is_dataclass(kind) else MISSING
     return _config_value(field.default)
 
 
@@ -303,8 +295,6 @@ def _config_type(hint: Any) -> Any:
 
 def _config_value(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-        return schema(type(value))(**{name: _config_value(part) for name, part in parts.items()})
-    if isinstance(value, tuple):
-        return [_config_value(item) for item in value]
-    return value
+        parts = {f.name: _config_value(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return schema(type(value))(**parts)
+    return [_config_value(item) for item in value] if isinstance(value, tuple) else value

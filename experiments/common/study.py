@@ -1,8 +1,8 @@
-"""A study: what it computes, and what the runner and the writer of results need of it.
+"""A study: what it computes, and what the runner and the writer of results need from it.
 
-A study is a module ``experiments/studies/NAME.py`` (or a package of that name) with the object
-``STUDY``. It is found by being there. What a study refuses, or what builds its parts, it refuses by
-an `MvestError`, which the runner says in one line.
+A study is a module ``experiments/studies/NAME.py``, or a package of that name, with an object
+``STUDY``; it needs no registration. It refuses a request by an `MvestError`, which the runner
+prints in one line.
 """
 
 from __future__ import annotations
@@ -24,25 +24,23 @@ if TYPE_CHECKING:
 
 S = TypeVar("S")
 
-Check = Callable[[Mapping[str, Any], Path], str]
-
-ROOMS = Path(experiments.studies.__file__).parent
+STUDIES = Path(experiments.studies.__file__).parent
 
 
 @dataclass(frozen=True, slots=True)
 class Job(Generic[S]):
-    """What a study is given.
+    """The input of a study.
 
     Attributes
     ----------
     values : mapping
-        The resolved configuration as plain data, for what all studies build alike.
+        The resolved configuration as plain data.
     settings : S
         The study's own part of it.
     folder : Path
         Output folder, which exists.
     config_hash : str
-        For studies that leave files beside their record.
+        For studies that write files next to their record.
     """
 
     values: Mapping[str, Any]
@@ -73,7 +71,7 @@ class Results:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no record has anything to show: all of them failed early."""
+        """Whether all records failed before they had anything to show."""
         return not any(one.tables or one.estimates for one in self.records.values())
 
     @property
@@ -84,10 +82,7 @@ class Results:
     def table(self, name: str = "") -> Table:
         """One table of all records; of several records a first column ``run`` names each.
 
-        Raises
-        ------
-        KeyError
-            If no record has it.
+        Raises a `KeyError` if no record has it.
         """
         parts = {one.row: one.table_of(name) for one in self.records.values() if name in one.tables}
         if not parts:
@@ -106,30 +101,27 @@ class Study(Generic[S]):
     run : callable
         Job -> result.
     summary : callable or None
-        Results -> tables for readers, by name. Without it readers see the results' own tables; with
-        it those are files for programs only.
+        Results -> tables for readers, by name. Readers then see these instead of the results' own
+        tables, which are still written as CSV.
     figure : callable or None
-        Results -> figure, or figures by name (``""`` is the main one), or None without anything to
-        draw.
+        Results -> figure, or figures by name (``""`` is the main one), or None if there is nothing
+        to draw.
     captions : mapping
         Name of a figure -> its caption.
     latex : tuple of str
-        Tables that are also written as LaTeX, and figures as PDF, by the names of their files: the
-        paper's own.
+        File names of the paper's own tables and figures, which are also written as LaTeX and PDF.
     words : callable or None
         Record -> text for the terminal; by default its tables.
     files : callable or None
-        (folder, record) -> files written into the folder of a run besides, a report for example.
+        (folder, record) -> further files written into the folder of a run, for example a report.
     keep : callable
-        Record -> what of it the results keep.
+        Record -> the part of it that is published.
     keep_arrays : callable
-        (record, file of arrays) -> arrays that the results keep beside the record; none by default.
+        (record, file of arrays) -> arrays that are published with the record; none by default.
     keeps_failures : bool
-        Whether the results also take over a run without an estimate: where a share of runs is
-        counted, failed ones count.
-    checks : callable
-        () -> what ``check=true`` says without estimating anything, each (configuration, output
-        folder) -> text. Made once for all jobs of a sweep.
+        Whether failed runs are published, too, because the study counts them.
+    check : callable or None
+        (configuration, output folder) -> text that ``check=true`` prints without estimating.
     require : callable
         Configuration -> None; raises `ConfigurationError` for settings that no job could run with.
     """
@@ -145,28 +137,25 @@ class Study(Generic[S]):
     keep: Callable[[Record], Record] = lambda record: record
     keep_arrays: Callable[[Record, Path], Mapping[str, Any]] = lambda record, path: {}
     keeps_failures: bool = False
-    checks: Callable[[], tuple[Check, ...]] = tuple
+    check: Callable[[Mapping[str, Any], Path], str] | None = None
     require: Callable[[Mapping[str, Any]], None] = lambda values: None
 
 
 def study_names() -> tuple[str, ...]:
     """Names of all studies, in alphabetical order."""
-    modules = [p.stem for p in ROOMS.glob("*.py") if p.stem != "__init__"]
-    packages = [p.parent.name for p in ROOMS.glob("*/study.py")]
+    modules = [p.stem for p in STUDIES.glob("*.py") if p.stem != "__init__"]
+    packages = [p.parent.name for p in STUDIES.glob("*/study.py")]
     return tuple(sorted([*modules, *packages]))
 
 
 def load_study(name: str) -> Study[Any]:
     """The study of that name; no other study is imported.
 
-    Raises
-    ------
-    ConfigurationError
-        If there is none.
+    Raises a `ConfigurationError` if there is none.
     """
     if name not in study_names():
         raise ConfigurationError(f"study = {name!r}, expected one of {', '.join(study_names())}")
     module = f"{experiments.studies.__name__}.{name}"
-    study = import_module(module if (ROOMS / f"{name}.py").is_file() else f"{module}.study").STUDY
+    study = import_module(module if (STUDIES / f"{name}.py").is_file() else f"{module}.study").STUDY
     assert isinstance(study, Study)
     return study

@@ -1,7 +1,7 @@
 """One table of all estimates of a folder: a row for each parameter of each case and seed.
 
-It is made for programs of statistics: one type and one stated unit a column (`COLUMNS`, written
-beside it as a data dictionary), failures as rows without numbers, nothing aggregated.
+It is made for statistics programs: each column has one type and one stated unit (`COLUMNS`, also
+written as a data dictionary), failures are rows without numbers, and nothing is aggregated.
 """
 
 from __future__ import annotations
@@ -70,13 +70,10 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
 def estimate_table(folder: Path) -> DataFrame:
     """The estimates of all records and sweeps below a folder of runs, or of published results.
 
-    A file that cannot be read, is foreign or is not as it was written costs a line of warning.
-    Copies that MLflow keeps are left out.
+    A file that is unreadable, foreign or changed costs a line of warning. MLflow's copies are left
+    out.
 
-    Raises
-    ------
-    InputError
-        If there is none.
+    Raises an `InputError` if there is none.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder")
@@ -107,12 +104,12 @@ def estimate_table(folder: Path) -> DataFrame:
 
 
 def sweep_table(sweep: Sweep) -> DataFrame:
-    """The estimates of a collected sweep; a row without numbers for a lost job."""
+    """The estimates of a collected sweep, with a row without numbers for a lost job."""
     return _typed(_of_sweep(sweep))
 
 
 def write_estimates(folder: Path, target: Path) -> list[Path]:
-    """Write the table of a folder (``.csv`` or ``.parquet``), and its data dictionary beside it.
+    """Write the table of a folder (``.csv`` or ``.parquet``), and its data dictionary next to it.
 
     Raises
     ------
@@ -137,14 +134,11 @@ def _below(folder: Path, name: str) -> list[Path]:
 
 
 def _of_sweep(sweep: Sweep, place: str | None = None) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
-    for job in sweep.jobs:
-        rows += _rows(job.record, place, job=job.hash)
-    return rows
+    return [row for job in sweep.jobs for row in _rows(job.record, place, job=job.hash)]
 
 
 def _rows(record: Record, place: str | None, **more: Any) -> Iterator[dict[str, Any]]:
-    """A row for each unknown of each estimate; one alone of a run that failed as a whole."""
+    """A row for each unknown of each estimate; one row for a run that failed as a whole."""
     source = record.provenance
     common = more | {
         "record": place,

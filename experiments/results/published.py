@@ -1,8 +1,8 @@
-"""The published results: which runs they take over, their records, and what follows from these.
+"""The published results: which runs are published, their records, and what follows from these.
 
-``results/records/TABLE.jsonl`` holds the records of a table, one a line; what figures need of a
-run's arrays lies in ``results/records/TABLE/NAME.npz``. A run is taken over only if it was run as
-it is configured.
+``results/records/TABLE.jsonl`` holds the records of a table, one a line, and
+``results/records/TABLE/NAME.npz`` the arrays that figures need. A run is published only if it was
+run as it is configured.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ RECORDS = "records"
 def publish_as(
     values: Mapping[str, Any], overrides: Sequence[str], swept: Mapping[str, Any] | None
 ) -> str | None:
-    """Name of a run's record in the results; None where they are not to be touched.
+    """Name of a run's record in the results; None: do not publish it.
 
-    ``swept`` is what the experiment itself varies (empty: nothing) if this is one run of several.
+    ``swept`` are the settings that the experiment itself varies if this is one run of several.
     """
     # A sweep is published as a whole.
     published = values["publish"] and not values["sweep"]
@@ -51,14 +51,14 @@ def publish_as(
 def as_published(
     overrides: Sequence[str], swept: Mapping[str, Any] | None, study: str | None
 ) -> bool:
-    """Whether a run is its experiment as configured: nothing overridden that changes the result."""
+    """Whether no override changes the result of the experiment as configured."""
     allowed = {"experiment", "hydra", *(swept or {})}
     keys = (override.lstrip("+~").partition("=")[0] for override in overrides)
     return all({key, key.partition(".")[0]} & allowed or not is_hashed(key, study) for key in keys)
 
 
 def as_configured(config: DictConfig) -> bool:
-    """Whether a sweep is run as it is published: nothing but its size is chosen."""
+    """Whether nothing but the size of a sweep is overridden."""
     task = config.hydra.overrides.task
     changed = [line for line in task if line.startswith("sweep.")]
     sized = all(line.startswith("sweep.size=") for line in changed)
@@ -66,12 +66,12 @@ def as_configured(config: DictConfig) -> bool:
 
 
 def publish_runs(runs: Iterable[tuple[str | None, Record | None, Path, Path]]) -> None:
-    """Let the results take over runs that have records of their own there.
+    """Publish runs.
 
     Parameters
     ----------
     runs : iterable of tuple
-        Name (None: the results are not to be touched), record, folder, and folder of the results.
+        Name (None: do not publish), record, folder, and folder of the results.
 
     Raises
     ------
@@ -89,13 +89,7 @@ def publish_runs(runs: Iterable[tuple[str | None, Record | None, Path, Path]]) -
 
 
 def publish_sweep(results: Path, sweep: Sweep) -> None:
-    """Let the results take over a sweep.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
-    """
+    """Publish a sweep; raises an `InputError` if a file cannot be written."""
     folder = results / SWEEPS
     folder.mkdir(parents=True, exist_ok=True)
     write_sweep_file(folder / f"{sweep.name}.json", sweep)
@@ -104,7 +98,7 @@ def publish_sweep(results: Path, sweep: Sweep) -> None:
 
 
 def arrays_of(folder: Path, name: str) -> dict[str, Path]:
-    """Name -> arrays of the run in a folder, if it left any."""
+    """Name -> file of arrays of the run in a folder, if there is one."""
     path = folder / FIELDS
     return {name: path} if path.is_file() else {}
 
@@ -112,13 +106,13 @@ def arrays_of(folder: Path, name: str) -> dict[str, Path]:
 def publish(
     study: Study[Any], results: Path, runs: Mapping[str, tuple[Record, Path]]
 ) -> list[Path]:
-    """Keep records of one table, and renew what follows from them.
+    """Publish records of one table, and write again what follows from them.
 
     Parameters
     ----------
     study : Study
     results : Path
-        The folder of all results; made if need be.
+        The folder of all results; made if missing.
     runs : mapping
         Name -> record and output folder of each run, at least one.
 
@@ -132,7 +126,7 @@ def publish(
     arrays: dict[str, Path] = {}
     try:
         place.mkdir(parents=True, exist_ok=True)
-        # Jobs of one experiment end in several processes at once.
+        # Several processes may publish at the same time.
         with FileLock(results / f".{table}.lock"):
             known = records_of(results, table)
             records = {} if known is None else dict(known.records)
@@ -146,22 +140,18 @@ def publish(
                 records[name] = study.keep(record)
                 arrays |= own
             write_records(results, table, records)
-            kept_now = records_of(results, table)
-            assert kept_now is not None
-            return write_results(
-                results, study, Results(kept_now.records, {**kept_now.arrays, **arrays})
-            )
+            published = records_of(results, table)
+            assert published is not None
+            shown = Results(published.records, {**published.arrays, **arrays})
+            return write_results(results, study, shown)
     except OSError as error:
         raise cannot_write(place, error) from error
 
 
 def regenerate(results: Path) -> list[Path]:
-    """Write every table, figure and page again that follows from published records and sweeps.
+    """Write every table, figure and page of published records and sweeps again.
 
-    Raises
-    ------
-    InputError
-        If there is no record, or one is damaged or not as it was written.
+    Raises an `InputError` if there is no record, or one is damaged or was changed.
     """
     paths = sorted((results / RECORDS).glob("*.jsonl"))
     sweeps = read_sweeps(results)
@@ -183,10 +173,7 @@ def regenerate(results: Path) -> list[Path]:
 def records_of(results: Path, table: str) -> Results | None:
     """The published records of a table, the one of its name first; None if there is none.
 
-    Raises
-    ------
-    InputError
-        If one is damaged.
+    Raises an `InputError` if one is damaged.
     """
     path = results / RECORDS / f"{table}.jsonl"
     if not path.is_file():

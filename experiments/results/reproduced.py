@@ -11,22 +11,14 @@ from mvest.errors import InputError
 from mvest.reporting.markup import number
 
 SAME = 1e-5
-"""Relative difference of estimates that machines and versions of libraries may make."""
+"""Relative difference of estimates between machines and versions of libraries."""
 
 
 def compared(table: str, own: Path, published: Path) -> str:
-    """One sentence: what each run gave, and whether that is what was published.
+    """One sentence: the result of each run, and whether it is the published one.
 
-    Parameters
-    ----------
-    table : str
-    own, published : Path
-        Folders of results.
-
-    Raises
-    ------
-    InputError
-        If one of them has no records of the table.
+    ``own`` and ``published`` are folders of results. Raises an `InputError` if one of them has no
+    records of the table.
     """
     mine, theirs = records_of(own, table), records_of(published, table)
     if mine is None or theirs is None:

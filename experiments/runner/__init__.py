@@ -1,5 +1,5 @@
 """How a study is run: alone, in a sweep, on a cluster, tracked.
 
-Each module imports those named before it: jobs, plan, compose, compared, tracking, cluster,
-engine, job.
+Each module imports only those named before it: jobs, plan, compose, metrics, tracking, cluster,
+engine, job, sweep, plugins.
 """

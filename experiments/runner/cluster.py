@@ -1,7 +1,7 @@
-"""Dask clusters as places for jobs: one that runs already, or one made for a sweep.
+"""Dask clusters for the jobs of a sweep: a running one, or one that is made for it.
 
 Dask places jobs, waits, adds and removes workers, and runs the job of a lost worker again on
-another one. What a job does to its own process is not dask's business: `engine.execute` sees to it.
+another one. Processes and limits of a job are not dask's business: `engine.execute` manages them.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ LOCAL, LOOPBACK = "LocalCluster", "127.0.0.1"
 """Dask's cluster of this machine, and where it listens."""
 
 CONNECT_S, START_S = 15, 60
-"""Seconds within which a scheduler answers, and the first worker on this machine is there."""
+"""Seconds for a scheduler to answer, and for the first worker on this machine to start."""
 
 DASK = {
-    # Jobs take minutes: none waits at a worker that is busy.
+    # Jobs take minutes: none is queued at a busy worker.
     "distributed.scheduler.worker-saturation": 1.0,
     "distributed.comm.timeouts.connect": "60s",
-    # The memory of a job is held where the job runs.
+    # The job's own process limits its memory.
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
 }
-"""Settings of dask for jobs in processes of their own."""
+"""Settings of dask for jobs in separate processes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineSettings:
-    """Who runs the jobs of a sweep; ``conf/hydra/launcher/jobs.yaml`` says what each means."""
+    """Where the jobs of a sweep run; ``conf/hydra/launcher/jobs.yaml`` explains each setting."""
 
     n_jobs: Annotated[int, within(-1024, 1024, "", "jobs; -1: one for each core")] = -1
     address: str | None = None
@@ -64,7 +64,7 @@ class EngineSettings:
 
     @property
     def at_a_time(self) -> int:
-        """Jobs that run at a time, as far as it is known."""
+        """Jobs that run at a time, if known."""
         if self.elsewhere:
             return self.jobs
         return max(1, self.n_jobs if self.n_jobs > 0 else (os.cpu_count() or 1) + 1 + self.n_jobs)
@@ -84,19 +84,18 @@ def run_on_dask(
 ) -> Generator[tuple[int, Record]]:
     """Run jobs as `engine.run_jobs` does, by ``execute`` on the workers of a cluster.
 
-    What ``stop`` does on each worker of a cluster of its own ends the jobs that run there.
+    An interrupt calls ``stop`` on each worker of a cluster that was made for the sweep.
     """
     import dask
     from distributed import as_completed
 
     for name in list(logging.root.manager.loggerDict):
         if name.startswith(("distributed", "asyncio", "tornado")):
-            # What matters is reported here, in one line.
             logging.getLogger(name).setLevel(logging.CRITICAL)
     own = requests[0].folder.resolve().parent / "dask"
     with dask.config.set(DASK), _client(settings, own, stop) as client:
-        # One call and keys of one group: only then do jobs wait at the scheduler, and not at a
-        # worker that may be lost. Other sweeps at the same scheduler have other keys.
+        # Jobs of one call with keys of one group are queued at the scheduler, not at workers,
+        # which may be lost. Other sweeps at the same scheduler have other keys.
         group = f"job-{uuid4().hex}"
         futures = client.map(
             _there,
@@ -114,7 +113,11 @@ def run_on_dask(
             if future.status in ("cancelled", "lost"):
                 raise OSError("dask's scheduler is gone")
             if future.status == "error":
-                record = _lost(requests[k], future.exception())
+                # Its workers were lost again and again.
+                error = future.exception()
+                reason = f"dask gave the job up: {type(error).__name__}: {error}"
+                require_writable(requests[k].folder)
+                record = write_failure(requests[k], reason, time.time())
             future.release()
             yield k, record
 
@@ -122,28 +125,17 @@ def run_on_dask(
 def _there(
     request: Request, *, execute: Execute, directory: str, requested_ns: int | None, at_a_time: int
 ) -> Record:
-    """Run a job in a worker of dask, from the folder in which its relative paths mean something."""
+    """Run a job in a worker of dask, in the folder that its relative paths start from."""
     os.chdir(directory)
     return execute(request, requested_ns, at_a_time)
 
 
-def _lost(request: Request, error: BaseException) -> Record:
-    """The record of a job whose workers were lost again and again."""
-    reason = f"dask gave the job up: {type(error).__name__}: {error}"
-    require_writable(request.folder)
-    return write_failure(request, reason, time.time())
-
-
 @contextmanager
 def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) -> Iterator[Client]:
-    """A client of the scheduler that is named, or of a cluster that ends with it.
+    """A client of the named scheduler, or of a new cluster that ends with the client.
 
-    The cluster's logs and certificates are in ``folder``.
-
-    Raises
-    ------
-    ConfigurationError
-        If there is none.
+    The cluster's logs and certificates are in ``folder``. Raises a `ConfigurationError` if there
+    is no such cluster.
     """
     from distributed import Client
 
@@ -157,13 +149,13 @@ def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) ->
                 where.sync(where._correct_state)
                 for worker in where.workers.values():
                     if worker.status.name == "created":
-                        # It could not be submitted; a second try raises the reason.
+                        # It could not be submitted; a second attempt raises the reason.
                         where.sync(worker.start)
                 if settings.adapt:
                     where.adapt(minimum=0, maximum=settings.jobs)
             client = stack.enter_context(Client(where, timeout=CONNECT_S))
             if settings.cluster == LOCAL:
-                # With wrong options it would start workers without end.
+                # With wrong options it would start workers forever.
                 client.wait_for_workers(1, START_S)
         except (OSError, RuntimeError, ValueError, TypeError, KeyError, ImportError) as error:
             name, why = settings.cluster or settings.address, one_line(error, 300)
@@ -172,26 +164,18 @@ def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) ->
             yield client
         except BaseException:
             if settings.cluster is not None:
-                # Its workers would wait for their jobs.
-                client.run(stop)
+                client.run(stop)  # its workers would wait for their jobs
             raise
 
 
 def _close(cluster: Any) -> None:
-    # Of workers that were never submitted it finds that they are not closed, last of all.
-    with suppress(AssertionError):
+    with suppress(AssertionError):  # because of workers that were never submitted
         cluster.close()
     cluster.shutdown_on_close = False
 
 
 def require_engine(settings: EngineSettings) -> None:
-    """Refuse a cluster that is not there, or for which nothing is installed.
-
-    Raises
-    ------
-    ConfigurationError
-        One line.
-    """
+    """Raise a `ConfigurationError` for an unknown cluster, or if dask is not installed."""
     if settings.n_jobs == 0:
         raise ConfigurationError("hydra.launcher.n_jobs = 0, expected 1 or more; -1: one each core")
     if settings.address and settings.cluster:
@@ -217,14 +201,14 @@ def _kinds() -> dict[str, Any]:
     before = {number: signal.getsignal(number) for number in ASKING}
     import dask_jobqueue
 
-    # On import it has them end the process with status 0.
+    # Its import installs handlers that end the process with status 0.
     for number, handler in before.items():
         signal.signal(number, handler)
     return {name: kind for name, kind in vars(dask_jobqueue).items() if name.endswith("Cluster")}
 
 
 def _cluster(name: str, options: Mapping[str, Any], folder: Path) -> Any:
-    """A cluster whose connections are encrypted, or stay on this machine."""
+    """A cluster with encrypted connections, or with local ones."""
     if name == LOCAL:
         from distributed import LocalCluster
 
@@ -244,7 +228,7 @@ def _cluster(name: str, options: Mapping[str, Any], folder: Path) -> Any:
         "memory": "4GB",
         "python": shlex.join(python("distributed")[:2]),
         "nanny": False,
-        # Certificates for this one cluster, in a folder that its nodes share.
+        # Certificates for this cluster only, in a folder that its nodes share.
         "security": True,
         "shared_temp_directory": str(folder),
         "log_directory": str(folder),

@@ -1,8 +1,8 @@
 """The jobs of a sweep, composed from the overrides of each.
 
-A grid is a mapping from settings to choices in Hydra's sweep syntax, and stands for the product of
-its choices. Several grids stand for their union. What the command line sets holds for every grid
-and replaces a grid's own choices.
+A grid maps settings to choices in Hydra's sweep syntax and means the product of its choices. A list
+of grids means their union. Settings of the command line hold for every grid and replace its own
+choices.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
-from tqdm import tqdm
 
 from experiments.common.config import hash_of, plain
+from experiments.common.progress import PartBar
 from experiments.results.published import as_configured, publish_as
 from experiments.runner.jobs import HASH_DIGITS, TIME_LIMIT_S, Request
 from experiments.runner.plan import Plan, earlier
@@ -31,20 +31,15 @@ from mvest.errors import ConfigurationError
 def expand(config: DictConfig, arguments: Sequence[str], loader: ConfigLoader) -> list[list[str]]:
     """The overrides of every job of a sweep, in Hydra's order.
 
-    Parameters
-    ----------
-    config : DictConfig
-        The sweep's own configuration, with Hydra's part.
-    arguments : sequence of str
-        Of the command line.
-    loader : ConfigLoader
+    ``config`` is the sweep's own configuration with Hydra's part, ``arguments`` are those of the
+    command line.
 
     Raises
     ------
     ConfigurationError
         If the sweep has no such size, no grid, or no job.
     HydraException
-        If a line is none of Hydra's, or varies a setting continuously.
+        If a line is not in Hydra's syntax, or varies a setting continuously.
     """
     parser = OverridesParser.create(config_loader=loader)
     found: list[list[str]] = []
@@ -85,7 +80,7 @@ def make_plan(
         If a job cannot be composed.
     """
     swept = config.hydra.sweeper.get("params") or {}
-    # As they were typed: an interpolation in them means something in a job only.
+    # Unresolved, because an interpolation can be resolved only within a job.
     typed: Any = OmegaConf.to_container(config.hydra.overrides.task)
     parser = OverridesParser.create(config_loader=loader)
     varied = _varied(config, typed, jobs, parser)
@@ -95,44 +90,49 @@ def make_plan(
     is_group = cache(lambda name: bool(loader.get_group_options(name)))
     merged: dict[tuple[str, ...], DictConfig] = {}
     planned: list[Request] = []
-    for number, overrides in enumerate(tqdm(jobs, "composing", disable=None, leave=False), first):
-        parsed = {one.get_key_element(): one for one in map(parse, overrides)}
-        # Hydra merges files for a tenth of a second. What it merges follows from all but the
-        # values; those are set in what was merged for an earlier job that sets the same ones.
-        settings = [
-            one for one in parsed.values() if _sets_value(one) and not is_group(one.key_or_group)
-        ]
-        kind = tuple(
-            str(one.key_or_group if one in settings else one.input_line) for one in parsed.values()
-        )
-        if kind in merged:
-            for one in settings:
-                OmegaConf.update(merged[kind], one.key_or_group, one.value())
-        else:
-            merged[kind] = loader.load_sweep_config(config, list(overrides))
-            HydraConfig.instance().set_config(merged[kind])
-        composed = merged[kind]
-        values = plain(composed)
-        # Null removes the limit; without an override the default holds.
-        if values["time_limit_s"] is None and "time_limit_s" not in parsed:
-            values["time_limit_s"] = TIME_LIMIT_S
-        values["factors"] = {
-            **{key: _factor(one) for key, one in parsed.items() if key in varied},
-            **values["factors"],
-        }
-        # Many configurations fit into memory where they share what is alike in them.
-        shared = planned[0].values if planned else {}
-        for key in values.keys() & shared.keys():
-            # 1 and 1.0 are not written alike.
-            if json.dumps(values[key]) == json.dumps(shared[key]):
-                values[key] = shared[key]
-        config_hash = hash_of(values)
-        with read_write(composed.hydra), open_dict(composed.hydra):
-            composed.hydra.job.id = composed.hydra.job.num = number
-        subdir = config_hash[:HASH_DIGITS] if by_hash else str(composed.hydra.sweep.subdir)
-        folder = Path(str(composed.hydra.sweep.dir)) / subdir
-        published = publish_as(values, overrides, swept)
-        planned.append(Request(values, config_hash, folder, published, tuple(overrides)))
+    with PartBar(f"{config.name}, composing", len(jobs), "job") as bar:
+        for number, overrides in enumerate(jobs, first):
+            bar.step()
+            parsed = {one.get_key_element(): one for one in map(parse, overrides)}
+            # Merging files takes Hydra a tenth of a second. Jobs that set the same settings share
+            # the merged configuration, and only their values are set in it.
+            settings = [
+                one
+                for one in parsed.values()
+                if _sets_value(one) and not is_group(one.key_or_group)
+            ]
+            kind = tuple(
+                str(one.key_or_group if one in settings else one.input_line)
+                for one in parsed.values()
+            )
+            if kind in merged:
+                for one in settings:
+                    OmegaConf.update(merged[kind], one.key_or_group, one.value())
+            else:
+                merged[kind] = loader.load_sweep_config(config, list(overrides))
+                HydraConfig.instance().set_config(merged[kind])
+            composed = merged[kind]
+            values = plain(composed)
+            # Null removes the limit; without an override the default holds.
+            if values["time_limit_s"] is None and "time_limit_s" not in parsed:
+                values["time_limit_s"] = TIME_LIMIT_S
+            values["factors"] = {
+                **{key: _factor(one) for key, one in parsed.items() if key in varied},
+                **values["factors"],
+            }
+            # Equal parts are shared, so that many configurations fit into memory.
+            shared = planned[0].values if planned else {}
+            for key in values.keys() & shared.keys():
+                # As JSON, because 1 equals 1.0.
+                if json.dumps(values[key]) == json.dumps(shared[key]):
+                    values[key] = shared[key]
+            config_hash = hash_of(values)
+            with read_write(composed.hydra), open_dict(composed.hydra):
+                composed.hydra.job.id = composed.hydra.job.num = number
+            subdir = config_hash[:HASH_DIGITS] if by_hash else str(composed.hydra.sweep.subdir)
+            folder = Path(str(composed.hydra.sweep.dir)) / subdir
+            published = publish_as(values, overrides, swept)
+            planned.append(Request(values, config_hash, folder, published, tuple(overrides)))
     sweep: Any = OmegaConf.to_container(config.sweep, resolve=True)
     return Plan(
         name=str(config.name),
@@ -146,7 +146,7 @@ def make_plan(
 
 
 def _grids(config: DictConfig) -> list[dict[str, Any]]:
-    """The grids that a sweep's size, or the sweeper's own parameters, stand for."""
+    """The grids of a sweep's size, or of the sweeper's own parameters."""
     found = config.hydra.sweeper.get("params")
     if config.sweep:
         sizes = [str(key) for key, value in config.sweep.items() if OmegaConf.is_config(value)]
@@ -162,7 +162,7 @@ def _grids(config: DictConfig) -> list[dict[str, Any]]:
 
 
 def _sets_value(override: Override) -> bool:
-    """Whether an override sets a single value of a setting, and merges nothing."""
+    """Whether an override sets a single value and merges nothing."""
     changes = override.type == OverrideType.CHANGE and override.package is None
     return changes and not isinstance(override.value(), dict)
 
@@ -170,9 +170,9 @@ def _sets_value(override: Override) -> bool:
 def _varied(
     config: DictConfig, typed: list[str], jobs: Sequence[Sequence[str]], parser: OverridesParser
 ) -> set[str]:
-    """Settings that are varied and that become factors of the jobs.
+    """Settings that are varied and become factors of the jobs.
 
-    What a sweep's own grid varies is left out: its configuration names factors itself.
+    A sweep's own grid is left out, because its configuration names the factors itself.
     """
     swept = parser.parse_overrides(typed)
     first = set(jobs[0]) if jobs else set()

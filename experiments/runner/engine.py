@@ -1,8 +1,8 @@
-"""Runs each job in a worker process, so that a crash, too much time or memory cost that job alone.
+"""Runs each job in a worker process, so that a crash or a limit costs only that job.
 
 A worker runs job after job and is replaced after a crash, or when memory or time ran out. The jobs
 of a sweep run on the threads of this process, or on the workers of a dask cluster (`cluster`);
-both call `execute` for each.
+both call `execute` for each job.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ WORKER = python("experiments.runner.job")
 """Command of a process that runs jobs."""
 
 LEAVE_S = 2.0
-"""Time for a worker without a job to exit by itself."""
+"""Time in which a worker without a job exits by itself."""
 
 
 class StoppedError(Exception):
-    """The worker was stopped from outside; nothing of its job is recorded."""
+    """The worker was stopped from outside; its job has no record."""
 
 
 class WorkerProcess:
-    """A process that runs jobs; started for the first one, and again after it ended."""
+    """A process that runs jobs. It is started for the first job, and again after it ended."""
 
     def __init__(self, command: Sequence[str] = ()) -> None:
         self._command = command or WORKER
@@ -48,10 +48,10 @@ class WorkerProcess:
         atexit.register(self.close)
 
     def run(self, request: Request, at_a_time: int = 1, *, aloud: bool = False) -> str | None:
-        """Run one job; None if it wrote its record, otherwise the reason why it did not.
+        """Run one job; None if it wrote its record, otherwise the reason.
 
-        With ``aloud`` the job's progress is shown, and a refusal is a `ConfigurationError`. Raises
-        `StoppedError` if `stop` was called. See `run_apart`.
+        With ``aloud`` the progress of the job is shown, and a refusal is a `ConfigurationError`.
+        Raises `StoppedError` after `stop`.
         """
         if self._program is not None and self._program.process.poll() is not None:
             self.close()
@@ -79,7 +79,7 @@ class WorkerProcess:
                 process.stdin.flush()
                 line = process.stdout.readline()
         except BaseException:
-            # Interrupted: the job must not go on alone.
+            # Interrupted: the job ends, too.
             program.end()
             self.close()
             raise
@@ -108,13 +108,13 @@ class WorkerProcess:
             return
         process: Any = program.process
         with suppress(OSError, TimeoutExpired):
-            # Without a job it exits by itself; a signal would disturb its clean-up.
+            # A signal would disturb its clean-up.
             process.stdin.close()
             process.wait(LEAVE_S)
         program.close()
 
     def stop(self) -> None:
-        """End the process for good, from another thread than the one that waits for its job."""
+        """End the process for good; called from another thread than `run`."""
         self._stopped = True
         program = self._program
         if program is not None:
@@ -126,22 +126,21 @@ def run_jobs(
 ) -> Generator[tuple[int, Record]]:
     """Run jobs; yields the position of each and the head of its record, as they end.
 
-    Closing the iterator early, as an interrupt does, ends the jobs that run; nothing is recorded
-    of them.
+    Closing the iterator early, as an interrupt does, ends the running jobs without a record.
 
     Parameters
     ----------
     requests : sequence of Request
     settings : EngineSettings
     at_a_time : int
-        Jobs that run on one machine beside each other and share its memory.
+        Jobs that run at a time on one machine and share its memory.
     requested_ns : int or None
-        As in `run_apart`.
+        As in `usable_record`.
 
     Raises
     ------
     ConfigurationError
-        If there is no such cluster, or it cannot be reached.
+        If the cluster does not exist or cannot be reached.
     OSError
         If dask's scheduler is lost.
     """
@@ -164,7 +163,7 @@ def run_jobs(
 
 
 _idle: dict[str, list[WorkerProcess]] = {}
-"""Folder in which a process works -> those that have no job."""
+"""Working folder -> worker processes without a job."""
 
 _busy: set[WorkerProcess] = set()
 
@@ -172,10 +171,9 @@ _busy: set[WorkerProcess] = set()
 def run_apart(
     request: Request, requested_ns: int | None = None, at_a_time: int = 1, *, aloud: bool = False
 ) -> Record:
-    """Run a job as `attempt` does, in a process that this one starts once for its jobs.
+    """Run a job as `attempt` does, in a worker process.
 
-    ``at_a_time`` jobs share the memory of this machine. ``aloud`` is that of `WorkerProcess.run`.
-    Raises a `MvestError` if nothing can be recorded, or a job that runs aloud is refused.
+    ``at_a_time`` jobs share the memory of this machine; for ``aloud`` see `WorkerProcess.run`.
     """
     idle = _idle.setdefault(str(Path.cwd()), [])
     try:
@@ -192,16 +190,15 @@ def run_apart(
 
 
 def execute(request: Request, requested_ns: int | None = None, at_a_time: int = 1) -> Record:
-    """Run a job as `run_apart` does; returns the head of its record, whatever becomes of it."""
+    """Run a job as `run_apart` does; returns the head of its record, also if none was written."""
     try:
         record = run_apart(request, requested_ns, at_a_time)
     except (MvestError, OSError) as error:
-        # Not even a record of the failure could be written.
         record = failed_record(request, str(error))
     return head_of(record)
 
 
 def stop_jobs() -> None:
-    """End the jobs that run in processes of this one; nothing is recorded of them."""
+    """End the running jobs of this process without a record."""
     for worker in list(_busy):
         worker.stop()

@@ -1,8 +1,8 @@
-"""One run of one configuration: refuse what is wrong, build, simulate, estimate, write down.
+"""One run of one configuration: check it, compute, write the record and everything that follows.
 
 As a program it runs jobs one after the other for the process that started it (`engine`): requests
-are lines of JSON on standard input, answers lines of JSON on standard output. What a job itself
-prints, crashes of compiled code included, goes to the log in its folder.
+are lines of JSON on standard input, answers are lines of JSON on standard output. The output of a
+job, crashes of compiled code included, goes to the log in its folder.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -22,10 +22,11 @@ from typing import Any
 
 from experiments.common.building.closure import mechanics_of
 from experiments.common.config import hash_of
+from experiments.common.progress import wrapped
 from experiments.common.records.record import Record
 from experiments.common.records.writer import words_of, write_results
 from experiments.common.schema import build
-from experiments.common.study import Check, Job, Results, Study, load_study, study_names
+from experiments.common.study import Job, Results, Study, load_study, study_names
 from experiments.console import raised
 from experiments.results.published import arrays_of
 from experiments.runner.engine import run_apart
@@ -50,47 +51,40 @@ from mvest.reading.text import one_line
 def require_admissible(values: Mapping[str, Any]) -> None:
     """Refuse settings that no job could run with.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible; the message names it.
+    Raises an `MvestError` if a setting is inadmissible; the message names it.
     """
     require_no_password(values["tracking"]["uri"])
     mechanics_of(values)
     load_study(values["study"]).require(values)
 
 
-def require_checks(values: Mapping[str, Any]) -> tuple[Check, ...]:
-    """What ``check=true`` says of a study.
+def check_of(values: Mapping[str, Any]) -> Callable[[Mapping[str, Any], Path], str]:
+    """The check of a study, for ``check=true``.
 
-    Raises
-    ------
-    ConfigurationError
-        If it has nothing to say of studies of this kind.
+    Raises a `ConfigurationError` if studies of this kind have none.
     """
-    checks = load_study(values["study"]).checks()
-    if not checks:
-        kinds = ", ".join(name for name in study_names() if load_study(name).checks())
+    check = load_study(values["study"]).check
+    if check is None:
+        kinds = ", ".join(name for name in study_names() if load_study(name).check)
         raise ConfigurationError(
-            f"experiment {values['name']}: check=true has nothing to say of a study of the kind "
-            f"{values['study']}; expected one of {kinds}"
+            f"experiment {values['name']}: a study of the kind {values['study']} has no "
+            f"check=true; expected one of {kinds}"
         )
-    return checks
+    return check
 
 
 def run_job(request: Request) -> Record:
-    """Run a job unless it is done, in this process unless it has a time limit; show its result.
+    """Run a job unless it is done, and show its result.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible or a file cannot be written.
+    It runs in this process unless it has a time limit.
+
+    Raises an `MvestError` if a setting is inadmissible or a file cannot be written.
     """
     values, folder = request.values, request.folder
     record = usable_record(request)
     if record is not None:
         source = record.provenance
-        _tell(record, folder)
+        _show(record, folder)
         print(
             f"Done on {source.finished} by commit {(source.git.sha or 'unknown')[:12]}; "
             "force=true runs it again"
@@ -102,15 +96,15 @@ def run_job(request: Request) -> Record:
     # Only another process can be stopped at any moment.
     record = run_apart(request, aloud=True)
     if record.converged:
-        _tell(record, folder)
+        _show(record, folder)
     return record
 
 
 def compute(request: Request, memory_gb: float) -> None:
-    """Run a job in its folder, which is locked, and write its record.
+    """Run a job in its folder, which is locked, and write its record and all that follows.
 
-    The record comes first. Where something after it cannot be written, the next run of the job
-    writes that, and computes nothing again.
+    If a file after the record cannot be written, the next run of the job writes it and computes
+    nothing again.
 
     Raises
     ------
@@ -119,19 +113,28 @@ def compute(request: Request, memory_gb: float) -> None:
     MemoryError
         If it needs more memory; the message states the limit.
     """
+    folder, values = request.folder, request.values
     with held_memory(memory_gb):
         write_hydra(request)
-        study = load_study(request.values["study"])
-        record = last_record(request.folder, request.config_hash, cut_off=True)
+        study = load_study(values["study"])
+        record = last_record(folder, request.config_hash, cut_off=True)
         record = record or _computed(study, request)
         try:
-            _write_out(study, request, record)
+            if values["figures"]:
+                name = record.experiment
+                write_results(folder, study, Results({name: record}, arrays_of(folder, name)))
+                if study.files is not None:
+                    study.files(folder, record)
+            _show(record, folder)
+            if record.converged:
+                mark_done(folder)
         except MemoryError:
             raise
         except Exception as error:
-            # Whatever a library for figures or texts raises: the numbers are not lost with it.
-            missing = UNWRITTEN.format(request.folder)
-            raise InputError(f"{one_line(message_of(error))}; {missing}") from error
+            # Whatever a library for figures or texts raises, the numbers are on disk.
+            raise InputError(
+                f"{one_line(message_of(error))}; {UNWRITTEN.format(folder)}"
+            ) from error
 
 
 def _computed(study: Study[Any], request: Request) -> Record:
@@ -139,27 +142,15 @@ def _computed(study: Study[Any], request: Request) -> Record:
     settings = build(study.settings, request.values)
     result = study.run(Job(request.values, settings, request.folder, request.config_hash))
     if hash_of(request.values) != request.config_hash:
-        # Nobody can say of which content it is the result.
+        # It is unknown which content was read.
         reason = "a file or folder that the settings name was changed before the job ended"
         result = result.changed(status="failed", reason=reason)
     return replace_record(request, result, started)
 
 
-def _write_out(study: Study[Any], request: Request, record: Record) -> None:
-    """All that follows from a record on disk, and the marker that says so."""
-    folder, name = request.folder, record.experiment
-    if request.values["figures"]:
-        write_results(folder, study, Results({name: record}, arrays_of(folder, name)))
-        if study.files is not None:
-            study.files(folder, record)
-    _tell(record, folder)
-    if record.converged:
-        mark_done(folder)
-
-
-def _tell(record: Record, folder: Path) -> None:
-    """Print the result, and where it is."""
-    print(words_of(load_study(record.study), record))
+def _show(record: Record, folder: Path) -> None:
+    """Print the result, its folder, and the file to open."""
+    print(wrapped(words_of(load_study(record.study), record)))
     print(f"Written to {folder}")
     if (page := folder / "report.html").is_file():
         print(f"Report: {page}")
@@ -168,30 +159,29 @@ def _tell(record: Record, folder: Path) -> None:
 def main() -> None:
     """Answer requests until the input is closed."""
     requests, answers = (os.fdopen(os.dup(k), "rw"[k], encoding="utf-8") for k in (0, 1))
-    # Neither what a job prints nor a program that it starts may reach these two.
+    # Neither the prints of a job nor the programs that it starts may use these two.
     nothing, terminal = os.open(os.devnull, os.O_RDWR), os.dup(2)
     os.dup2(nothing, 0)
     os.dup2(nothing, 1)
     faulthandler.enable()
     with suppress(OSError):  # the system kills this process first when memory runs out
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
-    # Asked to stop, it removes its temporary files.
+    # On a signal to stop, it removes its temporary files.
     with suppress(KeyboardInterrupt), raised():
         for line in requests:
             order = json.loads(line)
-            memory_gb, aloud = order.pop("memory_gb"), order.pop("aloud")
             request = Request.from_json(order)
             with (request.folder / LOG).open("wb") as log:
-                for stream in (1,) if aloud else (1, 2):
+                for stream in (1,) if order["aloud"] else (1, 2):
                     os.dup2(log.fileno(), stream)
-            answered = answer(request, memory_gb)
+            answered = answer(request, order["memory_gb"])
             with suppress(OSError):  # the log's disk is full
                 sys.stdout.flush()
             os.dup2(nothing, 1)
             os.dup2(terminal, 2)
             answers.write(json.dumps(answered) + "\n")
             answers.flush()
-            # What a job leaves behind goes before the next; what stays is not looked through again.
+            # Collect the garbage of this job; what stays is not searched again.
             gc.collect()
             gc.freeze()
 
@@ -199,12 +189,12 @@ def main() -> None:
 def answer(request: Request, memory_gb: float) -> dict[str, Any]:
     """Run a job; the ``reason`` is None if it wrote its record.
 
-    ``refused`` says that the request is wrong, and that this process may run another one.
+    ``refused`` means that the request is wrong, and that this process may run another one.
     """
     try:
         compute(request, memory_gb)
     except Exception as error:
-        # Whatever it is costs its own job; the traceback is in the log.
+        # Any error costs only its own job; the traceback is in the log.
         traceback.print_exception(error, file=sys.stdout)
         reason = one_line(message_of(error))
         return {"reason": reason, "refused": isinstance(error, MvestError)}

@@ -1,9 +1,8 @@
-"""One job of the runner: its request, its folder, and what time and memory it may take (Linux).
+"""One job of the runner: its request, its folder, and its limits of memory (Linux).
 
-A request is plain data, so that another process can be given it. A job is done when the marker in
-its folder holds the digest of its record, and the record belongs to the requested configuration.
-The marker is written last. A record and its arrays are replaced only when their successors are on
-disk.
+A request is plain data, so that another process can get it. A job is done when the marker in its
+folder holds the digest of its record, and the record belongs to the requested configuration. The
+marker is written last. A record and its arrays are replaced only when the new ones are on disk.
 """
 
 from __future__ import annotations
@@ -21,23 +20,20 @@ from typing import Any
 
 import yaml
 from filelock import AcquireReturnProxy, FileLock, Timeout
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
-from experiments.common.config import hash_of, plain, require_in_range, without_places
+from experiments.common.config import require_in_range, without_places
 from experiments.common.records.record import Record, adopt_arrays, read_record, stamp, write_record
 from experiments.common.study import Result
-from experiments.results.published import publish_as
 from mvest.errors import InputError, message_of
 from mvest.files import remove_parts, require_writable, sha256_of, write_atomically
 from mvest.provenance import write_json
 
 DONE, RESULT, CONFIG, LOG, LOCK = "done", "result.json", "config.json", "log.txt", ".lock"
 HYDRA = ".hydra"
-"""Of a job: its marker, record, configuration, output, lock, and settings as Hydra writes them."""
+"""Files of a job: marker, record, configuration, output, lock, and folder of Hydra's settings."""
 
 UNWRITTEN = f"the estimate is in {{}}/{RESULT}, and the same command writes what is missing"
-"""What to say where the numbers of a job are on disk and something else could not be written."""
+"""Message for a job whose record is on disk while another file could not be written."""
 
 HASH_DIGITS = 16
 """Digits of its hash by which a job is named."""
@@ -46,27 +42,26 @@ TIME_LIMIT_S = 14_400.0
 """s, default for jobs of sweeps: 50 times the longest of those in ``results/`` (269 s)."""
 
 SHARE, GB = 0.8, 2**30
-"""Of the machine's memory, for all jobs at a time; and bytes, as Slurm counts them."""
+"""Share of the machine's memory that all jobs get; and bytes, as Slurm counts them."""
 
 PROCESS, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One composed configuration and where it is run.
+    """One composed configuration and its output folder.
 
     Attributes
     ----------
     values : dict
         The resolved configuration.
     config_hash : str
-        SHA-256 of what in it can change the result.
+        SHA-256 of everything in it that can change the result.
     folder : Path
-        Output folder of the job.
     publish_as : str or None
-        Name of its record in the results; None where they are not to be touched.
+        Name of its record in the results; None: do not publish it.
     overrides : tuple of str
-        What was requested in Hydra's syntax.
+        The request in Hydra's syntax.
 
     Raises
     ------
@@ -84,18 +79,10 @@ class Request:
         require_in_range(self.values)
 
     @classmethod
-    def of(cls, config: DictConfig) -> Request:
-        """What Hydra composed for the job it is just starting."""
-        hydra, values = HydraConfig.get(), plain(config)
-        overrides = tuple(hydra.overrides.task)
-        published = publish_as(values, overrides, None)
-        return cls(values, hash_of(values), Path(hydra.runtime.output_dir), published, overrides)
-
-    @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Request:
-        """The request that :meth:`to_json` wrote."""
-        typed = tuple(data["overrides"])
-        return cls(**{**data, "folder": Path(data["folder"]), "overrides": typed})
+        """The request that :meth:`to_json` wrote; other entries are ignored."""
+        own = {field.name: data[field.name] for field in fields(cls)}
+        return cls(**{**own, "folder": Path(data["folder"]), "overrides": tuple(data["overrides"])})
 
     def to_json(self) -> dict[str, Any]:
         """Plain data."""
@@ -109,13 +96,13 @@ class Request:
 
     @property
     def label(self) -> str:
-        """What sets the job apart, for a line of text."""
+        """What distinguishes the job, in a line of text."""
         factors = (f"{name}={value}" for name, value in self.values["factors"].items())
         return ", ".join(factors) or " ".join(self.overrides)
 
 
 class FailedRunError(Exception):
-    """A run ended without an estimate; it is recorded, with its reason, in its output folder."""
+    """A run ended without an estimate; its record, with the reason, is in its output folder."""
 
 
 def is_done(folder: Path) -> bool:
@@ -127,15 +114,15 @@ def is_done(folder: Path) -> bool:
 
 
 def mark_done(folder: Path) -> None:
-    """Say that everything that belongs to the present record is on disk."""
+    """Write the marker: everything that belongs to the present record is on disk."""
     write_atomically(folder / DONE, sha256_of(folder / RESULT))
 
 
 def last_record(folder: Path, config_hash: str, *, cut_off: bool = False) -> Record | None:
     """The record of the last attempt; None if there is none of this version and configuration.
 
-    Unless ``cut_off`` it is a failure, or a success that is done. With it, it is a success that is
-    not: something that follows from it could not be written.
+    It is a failure, or a success that is done. With ``cut_off`` it is a success that is not done:
+    a file that follows from it could not be written.
     """
     try:
         record = read_record(folder / RESULT)
@@ -162,7 +149,7 @@ def usable_record(request: Request, requested_ns: int | None = None) -> Record |
 def attempt(
     request: Request, run: Callable[[], str | None], requested_ns: int | None = None
 ) -> Record:
-    """Run a job unless it is done; returns its record, whatever happened.
+    """Run a job unless it is done; returns its record, of a success or a failure.
 
     Parameters
     ----------
@@ -177,7 +164,7 @@ def attempt(
     MvestError
         If nothing can be recorded, or ``run`` raises one.
     """
-    folder, config_hash = request.folder, request.config_hash
+    folder = request.folder
     require_writable(folder)
     with lock(folder):
         record = usable_record(request, requested_ns)
@@ -188,20 +175,15 @@ def attempt(
                 reason = run()
             except MemoryError as error:
                 reason = message_of(error)
-            record = None if reason else last_record(folder, config_hash)
+            record = None if reason else last_record(folder, request.config_hash)
             record = record or write_failure(request, reason or "it left no record", started)
         return record
 
 
 def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
-    """Keep other processes out of the folder until the context is left or this process ends.
+    """Lock the folder until the context or this process ends; prints a note if it has to wait.
 
-    Says so if it has to wait for another process.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be locked.
+    Raises an `InputError` if the folder cannot be locked.
     """
     held = FileLock(folder / LOCK)
     try:
@@ -217,8 +199,7 @@ def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
 def make_way(request: Request) -> None:
     """Remove what an unfinished attempt left, except a record whose outputs are missing.
 
-    A finished record stays until its replacement is whole. A note says if it was changed since it
-    was written.
+    A finished record stays until its replacement is complete. A note reports a changed record.
     """
     folder = request.folder
     adopt_arrays(folder / RESULT)
@@ -267,7 +248,7 @@ def write_failure(request: Request, reason: str, started: float) -> Record:
 
 
 def failed_record(request: Request, reason: str) -> Record:
-    """The record, written nowhere, of a job without an estimate."""
+    """The record of a job without an estimate; it is not written."""
     result = Result(status="failed", reason=reason)
     return stamp(request.values, request.config_hash, result, time.time())
 
@@ -275,10 +256,7 @@ def failed_record(request: Request, reason: str) -> Record:
 def write_hydra(request: Request) -> None:
     """Write the resolved configuration and the overrides where Hydra's users expect them.
 
-    Raises
-    ------
-    InputError
-        If they cannot be written.
+    Raises an `InputError` if they cannot be written.
     """
     place = request.folder / HYDRA
     place.mkdir(exist_ok=True)
@@ -289,17 +267,16 @@ def write_hydra(request: Request) -> None:
 
 @contextmanager
 def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
-    """Remove a job's folder, and those of the outputs above it, if nothing was written there.
+    """Remove a job's folder, and its parents within the outputs, if nothing was written there.
 
-    Hydra makes the folder before anyone has checked the request.
+    Hydra makes the folder before the request is checked.
     """
     try:
         yield
     finally:
         above = [p for p in folder.resolve().parents if p.is_relative_to(outputs.resolve())]
-        with suppress(OSError):  # something else is there
+        with suppress(OSError):  # not empty, or another process works there and holds the lock
             if {path.name for path in folder.iterdir()} <= {LOCK, HYDRA}:
-                # Whoever holds the lock is at work there.
                 with FileLock(folder / LOCK).acquire(timeout=0):
                     shutil.rmtree(folder / HYDRA, ignore_errors=True)
                     (folder / LOCK).unlink()
@@ -323,8 +300,8 @@ def default_memory_gb(jobs: int = 1) -> float:
 def held_memory(limit_gb: float) -> Iterator[None]:
     """Limit the memory of this process, and of each program that it starts meanwhile.
 
-    What it has left of its limit at the start may be allocated (``RLIMIT_DATA``). Beyond that it
-    raises a `MemoryError` that states the limit and the peak.
+    The process may allocate what it has left of the limit (``RLIMIT_DATA``). Beyond that it raises
+    a `MemoryError` that states the limit and the peak.
     """
     before, hard = resource.getrlimit(resource.RLIMIT_DATA)
     # Arrow's own allocator would reserve 1 GB for its first string.
@@ -335,7 +312,7 @@ def held_memory(limit_gb: float) -> Iterator[None]:
         allowed = reserved + max(0, int(limit_gb * GB) - resident)
         soft = allowed if hard == resource.RLIM_INFINITY else min(allowed, hard)
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-        # The peak is counted anew; where that is not allowed it is that of all jobs so far.
+        # Resets the peak; if that is not permitted, it is the peak of all jobs so far.
         (PROCESS / "clear_refs").write_text("5", encoding="ascii")
     try:
         yield

@@ -1,6 +1,6 @@
-"""What a sweep will run: its jobs, which are done, how long the others take, what all ended with.
+"""The jobs of a sweep: which are done, how long the others take, and what all gave.
 
-``plan.json`` in the sweep's folder is all that is needed to work on it: by shards under any
+``plan.json`` in the sweep's folder is all that is needed to work on the sweep: by shards under any
 scheduler (`Plan.read`), by MLflow, and by the same command when it goes on.
 """
 
@@ -20,22 +20,22 @@ from experiments.common.records.record import Record, here_and_now
 from experiments.runner.jobs import Request, failed_record, last_record
 from experiments.sweeps.collected import Sweep, SweptJob, head_of
 from mvest.errors import ConfigurationError, InputError
-from mvest.provenance import config_hash, git_state, write_json
+from mvest.provenance import config_hash, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line
 
 PLAN = "plan.json"
-"""File in a sweep's folder with the jobs that it consists of."""
+"""File in a sweep's folder that lists its jobs."""
 
 NOT_COMMON = ("factors", "paths", "tracking", "sweep")
-"""Settings that jobs do not have in common, or that belong to a machine or the runner."""
+"""Settings that differ between jobs, or that belong to a machine or the runner."""
 
 NOT_RUN = "not run"
 """Reason of a job that never began or was interrupted."""
 
 
 def earlier(jobs: Iterable[Request]) -> dict[str, Record]:
-    """Hash of a configuration -> head of the record of the last attempt, of jobs that have one."""
+    """Hash of a configuration -> head of the record of its last attempt, if it has one."""
     records = ((job.config_hash, last_record(job.folder, job.config_hash)) for job in jobs)
     return {key: head_of(record) for key, record in records if record is not None}
 
@@ -54,11 +54,12 @@ class Plan:
         The configuration's ``sweep``, empty for jobs swept on the command line.
     jobs : tuple of Request
     before : mapping
-        What earlier attempts ended with, see `earlier`.
+        Records of earlier attempts, see `earlier`.
     workers : int
-        Jobs that run at a time; 1 where it is not known.
+        Jobs that run at a time; 1 if unknown.
     publish : bool or None
-        Whether the results take the sweep over; None: they are not to.
+        Whether the sweep is copied to the results; False: it would be, but for its overrides; None:
+        it is not to be published.
     written_ns : int or None
         When the plan was written; None: it was not.
     """
@@ -79,7 +80,7 @@ class Plan:
 
     @property
     def done(self) -> dict[str, Record]:
-        """Of the earlier attempts those with a result."""
+        """The earlier attempts with a result."""
         return {key: record for key, record in self.before.items() if record.converged}
 
     @property
@@ -107,12 +108,12 @@ class Plan:
                 )
 
     def write(self) -> Plan:
-        """Write ``plan.json`` into the sweep's folder; returns the plan as it was written.
+        """Write ``plan.json`` into the sweep's folder; returns the plan with `written_ns`.
 
-        Of the configurations the first one is written whole, of the others what differs.
+        The first configuration is written whole, of the others only the differences.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        created = time.gmtime()
+        place, created = self.folder / PLAN, time.gmtime()
         jobs = [
             job.to_json()
             | {
@@ -127,36 +128,32 @@ class Plan:
         ]
         sweep_id = f"{time.strftime('%Y%m%d-%H%M%S', created)}-{uuid.uuid4().hex[:4]}"
         try:
-            before = read_mapping(self.folder / PLAN)
-            # The same jobs, perhaps with more of them, are the same sweep that goes on.
+            before = read_mapping(place)
+            # The same jobs, perhaps with more of them, continue the same sweep.
             if {job["hash"] for job in before["jobs"]} <= {job["hash"] for job in jobs}:
                 sweep_id = before["sweep_id"]
         except (InputError, KeyError, TypeError):
-            # The first sweep here.
-            pass
-        write_json(
-            self.folder / PLAN,
-            {
-                "sweep": self.sweep.get("name", self.name),
-                "size": self.sweep.get("size"),
-                "sweep_id": sweep_id,
-                "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", created),
-                "name": self.name,
-                "settings": self.sweep,
-                "publish": self.publish,
-                # Paths in a configuration are relative to where the command was typed.
-                "directory": Path.cwd(),
-                "values": self.common,
-                "jobs": jobs,
-            },
-        )
-        return replace(self, written_ns=(self.folder / PLAN).stat().st_mtime_ns)
+            pass  # the first sweep here
+        plan = {
+            "sweep": self.sweep.get("name", self.name),
+            "size": self.sweep.get("size"),
+            "sweep_id": sweep_id,
+            "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", created),
+            "name": self.name,
+            "settings": self.sweep,
+            "publish": self.publish,
+            "directory": Path.cwd(),  # paths in a configuration are relative to it
+            "values": self.common,
+            "jobs": jobs,
+        }
+        write_json(place, plan)
+        return replace(self, written_ns=place.stat().st_mtime_ns)
 
     @classmethod
     def read(cls, folder: Path, *, look: bool = True) -> Plan:
-        """The plan in a sweep's folder; ``look`` reads what earlier attempts ended with.
+        """The plan in a sweep's folder; ``look`` reads the records of earlier attempts.
 
-        The process then works where the sweep was planned.
+        Changes to the directory in which the sweep was planned.
 
         Raises
         ------
@@ -172,17 +169,11 @@ class Plan:
             if not os.access(directory, os.X_OK):
                 raise InputError(f"directory {one_line(directory, 80)} cannot be entered")
             os.chdir(directory)
-            common = data["values"]
-            requests = [
-                Request(
-                    {k: v for k, v in common.items() if k not in job["without"]} | job["values"],
-                    job["config_hash"],
-                    place.parent / job["folder"],
-                    job["publish_as"],
-                    tuple(job["overrides"]),
-                )
-                for job in data["jobs"]
-            ]
+            common, requests = data["values"], []
+            for job in data["jobs"]:
+                shared = {k: v for k, v in common.items() if k not in job["without"]}
+                own = {"values": shared | job["values"], "folder": place.parent / job["folder"]}
+                requests.append(Request.from_json({**job, **own}))
             return cls(
                 data["name"],
                 place.parent,
@@ -199,11 +190,9 @@ class Plan:
             raise InputError(f"{place} is no plan of this version: {why}") from error
 
     def summary(self) -> str:
-        """How much is done, how much is left and how long it will take, in one line."""
+        """How many jobs are done and left, and how long they will take, in one line."""
         left, done = len(self.to_run), self.done
         failed, size = len(self.before) - len(done), self.sweep.get("size")
-        present = git_state(Path(__file__).resolve().parent)["sha"]
-        stale = sum(record.provenance.git.sha != present for record in done.values())
         takes = "nothing left"
         if left and done:
             mean = fmean(record.seconds_total for record in done.values())
@@ -211,10 +200,9 @@ class Plan:
             takes = f"about {total}, {self.workers} at a time"
         elif left:
             takes = "time unknown: no job has finished yet"
-        remark = f" ({stale} of the done ones by another commit; force=true redoes)"
         return (
             f"{self.name}{f' ({size})' if size else ''}: {len(self.jobs)} jobs, {len(done)} done, "
-            f"{failed} failed before, {left} to run{remark if stale else ''}; {takes}"
+            f"{failed} failed before, {left} to run; {takes}"
         )
 
     def listing(self) -> str:
@@ -228,17 +216,14 @@ class Plan:
         return "\n".join(lines)
 
     def collect(self, ended: Mapping[str, Record]) -> Sweep:
-        """What all jobs gave, in their order, failed and missing ones included.
+        """The results of all jobs, in their order; failed and missing jobs are included.
 
-        Parameters
-        ----------
-        ended : mapping
-            Hash of a configuration -> head of the record of a job that has just been run.
+        ``ended`` maps hashes of configurations to heads of records of jobs that have just run.
         """
-        known = {**self.before, **ended}
-        records = [known[job.config_hash] for job in self.jobs if job.config_hash in known]
-        sources = [record.provenance for record in records]
-        first = self.common
+        known, first = {**self.before, **ended}, self.common
+        sources = [
+            known[one.config_hash].provenance for one in self.jobs if one.config_hash in known
+        ]
         return Sweep(
             name=str(self.sweep.get("name", self.name)),
             size=self.sweep.get("size"),
@@ -252,14 +237,16 @@ class Plan:
             ),
             commits=tuple(sorted({str(one.git.sha) for one in sources})),
             settings={key: value for key, value in first.items() if key not in NOT_COMMON},
-            jobs=tuple(_swept(job, known.get(job.config_hash)) for job in self.jobs),
+            jobs=tuple(
+                SweptJob(
+                    hash=job.short_hash,
+                    seed=job.values["seed"],
+                    repeats=job.values["repeats"],
+                    # A job that was computed for another sweep has the factors of that one.
+                    record=(known.get(job.config_hash) or failed_record(job, NOT_RUN)).model_copy(
+                        update={"factors": job.values["factors"]}
+                    ),
+                )
+                for job in self.jobs
+            ),
         )
-
-
-def _swept(job: Request, record: Record | None) -> SweptJob:
-    values, record = job.values, record or failed_record(job, NOT_RUN)
-    # One that was computed for another sweep has the factors of that.
-    record = record.model_copy(update={"factors": values["factors"]})
-    return SweptJob(
-        hash=job.short_hash, seed=values["seed"], repeats=values["repeats"], record=record
-    )

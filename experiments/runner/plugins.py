@@ -1,7 +1,7 @@
 """Plugins for Hydra: a sweeper for grids and their unions, and a launcher of many jobs.
 
-Both are Hydra's own kinds of plugins: the launcher serves any sweeper (``hydra/sweeper=basic``,
-optuna's), and the sweeper any launcher (``hydra/launcher=basic`` runs jobs in this process).
+Both work with Hydra's other plugins: the launcher with any sweeper (``hydra/sweeper=basic``,
+optuna's), and the sweeper with any launcher (``hydra/launcher=basic`` runs jobs in this process).
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 PLACE = "hydra_plugins.mvest"
-"""Where Hydra finds plugins: it takes them from modules of that package only."""
+"""Module of the plugins; Hydra accepts them only from the package ``hydra_plugins``."""
 
 
 class FailedSweepError(Exception):
-    """A job of a sweep has no estimate; this was reported."""
+    """A job of a sweep has no estimate; that was printed."""
 
 
 class GridSweeper(Sweeper):
-    """Gives all jobs of a grid, or of a union of grids, to the launcher at once.
+    """Passes all jobs of a grid, or of a union of grids, to the launcher at once.
 
     Parameters
     ----------
     params : mapping or sequence of mapping, optional
-        A grid (setting -> choices in Hydra's syntax), or several grids that stand for their union.
-        They are read from the configuration, where a sweep's own size takes their place.
+        A grid (setting -> choices in Hydra's syntax) or a list of grids. They are read from the
+        configuration, where a sweep's own size replaces them.
     """
 
     def __init__(self, params: object = None) -> None:
@@ -50,7 +50,7 @@ class GridSweeper(Sweeper):
         self._parts = hydra_context, config, launcher
 
     def sweep(self, arguments: list[str]) -> Sequence[JobReturn]:
-        """Expand and launch; returns what the launcher does.
+        """Expand and launch the jobs.
 
         Raises
         ------
@@ -73,7 +73,7 @@ class GridSweeper(Sweeper):
 class JobLauncher(Launcher):
     """Plans and checks jobs, runs those that are not done, and collects and logs all of them.
 
-    Each job runs in a process of its own; it returns its objective.
+    Each job runs in a separate process and returns its objective.
 
     Parameters
     ----------
@@ -99,9 +99,9 @@ class JobLauncher(Launcher):
         Raises
         ------
         MvestError, HydraException, OmegaConfBaseException
-            If the request is wrong; nothing is run then.
+            If the request is wrong; then nothing is run.
         """
-        # Takes seconds to import, which `--help` must not.
+        # Its import takes seconds, which `--help` must not.
         from experiments.runner.sweep import launch
 
         assert self._given is not None
@@ -110,7 +110,7 @@ class JobLauncher(Launcher):
 
 
 def register_plugins() -> None:
-    """Make them known to Hydra; may be called again."""
+    """Register them with Hydra; may be called again."""
     plugins = Plugins.instance()  # imports the package of plugins, if any other is installed
     package, _, name = PLACE.rpartition(".")
     place = ModuleType(PLACE)

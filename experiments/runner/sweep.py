@@ -1,9 +1,8 @@
-"""From the jobs of a sweep to its results: skip what is done, run the rest, collect, log."""
+"""From the jobs of a sweep to its results: skip finished jobs, run the rest, collect, log."""
 
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,26 +12,26 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig, OmegaConf
 
-from experiments.common.progress import PartBar, announce_compilation, say
+from experiments.common.progress import PartBar, say, wrapped
 from experiments.common.records.record import Record
 from experiments.common.schema import build, require_admissible_values
 from experiments.results.estimates import sweep_table
 from experiments.results.published import publish_runs, publish_sweep
 from experiments.runner.cluster import EngineSettings, require_engine
-from experiments.runner.compared import metrics
 from experiments.runner.compose import make_plan
 from experiments.runner.engine import run_jobs
-from experiments.runner.job import require_admissible, require_checks
+from experiments.runner.job import check_of, require_admissible
 from experiments.runner.jobs import FailedRunError, Request, last_record, nothing_empty
+from experiments.runner.metrics import metrics
 from experiments.runner.plan import NOT_RUN, Plan, earlier
-from experiments.runner.tracking import SWEEP, log_sweep
+from experiments.runner.tracking import SWEEP, log_run
 from experiments.sweeps.collected import Sweep, write_sweep_file
 from experiments.sweeps.report import text_of, write_sweep
 from mvest.errors import ConfigurationError, MvestError
 from mvest.files import require_writable, write_atomically
 
 MULTIRUN, TABLE = "multirun.yaml", "jobs.parquet"
-"""Files in a sweep's folder: its configuration as Hydra writes it, and all its jobs as a table."""
+"""Files in a sweep's folder: its configuration as Hydra writes it, and a table of all jobs."""
 
 PLANNED = "planned"
 """The sweeper that knows the grids of ``sweep=NAME``."""
@@ -66,7 +65,7 @@ def launch(
     Returns
     -------
     list of JobReturn
-        One for each job, with its objective; none where jobs were only planned or checked.
+        One for each job, with its objective; empty if jobs were only planned or checked.
     tuple of Request
         All jobs of the sweep so far.
 
@@ -97,30 +96,32 @@ def launch(
         except MvestError as error:
             raise ConfigurationError(f"{error} (job {' '.join(job.overrides)})") from error
     if config.dry_run:
-        print(batch.summary(), batch.listing(), sep="\n")
+        print(wrapped(f"{batch.summary()}\n{batch.listing()}"))
         return [], ()
     if config.check:
-        _run_checks(batch)
+        for study in {job.values["study"]: job for job in batch.jobs}.values():
+            check_of(study.values)  # refused before the first one runs
+        for job in batch.jobs:
+            print(job.label, check_of(job.values)(job.values, job.folder), "", sep="\n")
         return [], ()
     jobs = tuple({job.config_hash: job for job in (*before, *batch.jobs)}.values())
-    # What became of the jobs of earlier batches is on disk.
+    # The records of earlier batches are on disk.
     plan = replace(batch, jobs=jobs, before={**earlier(before), **batch.before})
     with nothing_empty(plan.folder, Path(config.paths.outputs)):
         require_writable(plan.folder)
         plan = plan.write()
         OmegaConf.save(config, plan.folder / MULTIRUN)
-    print(batch.summary())
+    print(wrapped(batch.summary()))
     if config.detach and batch.to_run:
         print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
-        print(f"`mvest collect {plan.folder}` writes what became of them")
+        print(f"`mvest collect {plan.folder}` collects and logs their results")
         return [], jobs
     ended = _run(plan, batch, settings)
     found = {job.hash: job.record for job in finish(plan, ended).jobs}
     returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
-    # Frees ten thousand records before they are logged.
     folder, common = plan.folder, plan.common
-    del ended, found, plan, batch
-    log_sweep(folder, common)
+    del ended, found, plan, batch  # frees ten thousand records before they are logged
+    log_run(folder, common)
     done = [one.return_value for one in returned if one.status == JobStatus.COMPLETED]
     if sweeper not in GIVEN_ONCE and any(map(math.isnan, done)):
         raise ConfigurationError(
@@ -135,7 +136,6 @@ def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]
     jobs = list({job.config_hash: job for job in batch.to_run}.values())
     if not jobs:
         return ended
-    announce_compilation("the first jobs")
     ends = run_jobs(jobs, settings, min(plan.workers, len(jobs)), plan.written_ns)
     try:
         with PartBar(plan.name, len(jobs), "job", plan.workers) as bar:
@@ -151,39 +151,27 @@ def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]
         raise
     except OSError as error:
         # The jobs that ended are on disk.
-        print(
-            f"error: the sweep cannot go on ({error}); run the same command again to go on",
-            file=sys.stderr,
-        )
+        say(f"error: the sweep cannot go on ({error}); run the same command again to go on")
     return ended
 
 
 def collect_sweep(folder: Path) -> int:
-    """Write and log what became of the jobs of a sweep that others work on, also before its end.
+    """Collect and log the results of a sweep that workers run, also before its end.
 
-    Returns
-    -------
-    int
-        Exit status: 1 if a job has no estimate.
+    Returns the exit status: 1 if a job has no estimate.
 
-    Raises
-    ------
-    MvestError
-        If nothing is planned in the folder, or the results cannot be written.
+    Raises an `MvestError` if nothing is planned in the folder, or the results cannot be written.
     """
     plan = Plan.read(folder)
     found = finish(plan, {})
-    log_sweep(plan.folder, plan.common)
+    log_run(plan.folder, plan.common)
     return 0 if all(record.converged for record in found.records) else 1
 
 
 def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
-    """Write, show and publish what became of a sweep.
+    """Write, show and publish the results of a sweep.
 
-    Raises
-    ------
-    MvestError
-        If the results cannot be written.
+    Raises an `MvestError` if the results cannot be written.
     """
     found = collected(plan, ended)
     print(text_of(found))
@@ -210,7 +198,7 @@ def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
 
 
 def collected(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
-    """Write ``sweep.json`` and say in a line how the sweep ended."""
+    """Write ``sweep.json`` and print in a line how the sweep ended."""
     path, left = plan.folder / SWEEP, {job.config_hash for job in plan.to_run}
     found = plan.collect(ended)
     write_sweep_file(path, found)
@@ -237,12 +225,3 @@ def _returned(job: Request, record: Record, objective: str) -> JobReturn:
         else FailedRunError(f"{record.reason} (recorded in {job.folder})")
     )
     return returned
-
-
-def _run_checks(plan: Plan) -> None:
-    """Say what the data of each job will tell; jobs that begin alike share what they compute."""
-    studies = {job.values["study"]: job.values for job in plan.jobs}
-    checks = {study: require_checks(values) for study, values in studies.items()}
-    for job in plan.jobs:
-        found = (check(job.values, job.folder) for check in checks[job.values["study"]])
-        print(job.label, *found, "", sep="\n")

@@ -1,7 +1,7 @@
-"""MLflow: what is logged of runs and sweeps (``mvest sync``), and its pages (``mvest dashboard``).
+"""MLflow: logging of runs and sweeps (``mvest sync``), and its pages (``mvest dashboard``).
 
-A run of the store with the same result is left, one with another is replaced, a missing one added.
-The store's database is made once.
+A run of the store with the same result stays, one with another result is replaced, and a missing
+one is added. The store's database is made once.
 """
 
 from __future__ import annotations
@@ -21,24 +21,16 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from statistics import fmean
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from filelock import FileLock
 from omegaconf import OmegaConf
-from tqdm import tqdm
 
+from experiments.common.progress import PartBar, say
 from experiments.common.records.record import read_record
-from experiments.runner.compared import (
-    Values,
-    implausible,
-    metrics,
-    settings_of,
-    text_of,
-    together,
-    varied,
-)
 from experiments.runner.jobs import CONFIG, RESULT, is_done
+from experiments.runner.metrics import Values, implausible, metrics, settings_of
 from experiments.runner.plan import PLAN
 from experiments.sweeps.collected import read_sweep
 from mvest.errors import ConfigurationError, InputError, MvestError
@@ -47,39 +39,35 @@ from mvest.processes import Program, environment, python
 from mvest.reading.documents import read_mapping
 
 SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
-"""Files of a sweep: its results; and of a run: what was typed."""
+"""Files: the results of a sweep; the overrides of a run."""
 
 FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
-"""Files that MLflow keeps a copy of; of a figure the picture, not its PDF."""
+"""Files that MLflow keeps a copy of."""
 
 MANY = 1000
-"""Jobs of a sweep above which only the sweep as a whole is a run."""
-
-Entry: TypeAlias = tuple[Path, str, Values, dict[str, float], float]
-"""Result file, name, tags (the first is no other run's), metrics, seconds computed."""
+"""A sweep with more jobs is one run of MLflow, without runs for its jobs."""
 
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
-"""Tags: of a job, its sweep's run; of a run that was logged to its end, the hash of its result."""
+"""Tags: the sweep's run of a job; the hash of the result, set when a run is logged completely."""
 
 MANNERS = {
-    # A server that is away is given up after seconds, not MLflow's minutes.
+    # Give up on an unreachable server after seconds, not minutes.
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
 }
-"""Settings of MLflow, unless the user has made them; its server inherits them."""
+"""Default settings of MLflow; its server inherits them."""
 
 ARTIFACTS, SQLITE = "mlartifacts", "sqlite:///"
-"""Folder of MLflow's copies of files in the outputs; beginning of a local database's address."""
+"""Folder of MLflow's copies in the outputs; beginning of a local database's address."""
 
 PASSWORD = re.compile(r"://[^/@:]*:[^/@]+@")
 BROKEN = re.compile(r"malformed|not a database|no such (table|column)|out-of-date database schema")
-"""What SQLite and MLflow say of a file that is no database, damaged, or was never finished."""
-
+"""Messages of SQLite and MLflow about a file that is no database, damaged, or incomplete."""
 
 MOST = 100
-"""Runs on MLflow's page of comparison, which reads them one by one."""
+"""Largest number of runs on MLflow's page of comparison, which reads them one by one."""
 
 SERVED = MANNERS | {
     "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
@@ -87,10 +75,10 @@ SERVED = MANNERS | {
     "MLFLOW_ENABLE_REMOTE_ASSISTANT": "false",
     "PYTHONSAFEPATH": "1",
 }
-"""Environment of the server: no telemetry, no jobs, no assistant, no module of a case's folder."""
+"""Environment of the server: no telemetry, no jobs, no assistant, no modules of the folder."""
 
 HOST = "mvest.localhost"
-"""This machine, by a name at which MLflow's pages do not open their assistant."""
+"""A name of this machine at which MLflow's pages do not open their assistant."""
 
 
 class TrackingError(MvestError):
@@ -98,7 +86,7 @@ class TrackingError(MvestError):
 
 
 def require_no_password(uri: str | None) -> None:
-    """Raise a `ConfigurationError` for an address that has a password."""
+    """Raise a `ConfigurationError` for an address with a password."""
     if uri is not None and PASSWORD.search(uri):
         raise ConfigurationError(
             "tracking.uri holds a password, which would be written into every config.json; leave "
@@ -108,12 +96,12 @@ def require_no_password(uri: str | None) -> None:
 
 @contextmanager
 def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
-    """MLflow, pointed at a store and an experiment, both made if need be; gives the address.
+    """Point MLflow at a store and an experiment, which are made if missing; yields the address.
 
     Raises
     ------
     TrackingError
-        If the store cannot be opened, or be written within: one line that names it.
+        If the store cannot be opened, or a write in the context fails: one line that names it.
     """
     require_no_password(uri)
     outputs = outputs.resolve()
@@ -129,10 +117,10 @@ def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
         for name in ("alembic", "mlflow"):
             logging.getLogger(name).setLevel(logging.ERROR)
         outputs.mkdir(parents=True, exist_ok=True)
-        # Several processes that open a fresh SQLite database at once would break it.
+        # Processes that open a new SQLite database at the same time would break it.
         with FileLock(outputs / ".mlflow.lock"):
             if is_local and file.exists() and file.stat().st_size:
-                # MLflow would ask a broken one again for minutes.
+                # With a broken one MLflow would retry for minutes.
                 address = f"{file.resolve().as_uri()}?mode=ro"
                 with closing(sqlite3.connect(address, 1.0, uri=True)) as database:
                     database.execute("select * from alembic_version, experiments").fetchone()
@@ -154,23 +142,21 @@ def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
 
 
 def log_run(folder: Path, config: Values) -> None:
-    """Log a run by itself; a store that fails costs a line of warning, and nothing is lost."""
-    if (folder / RESULT).is_file():
-        log_sweep(folder, config)
+    """Log a single run or a sweep, with the configuration of its first job.
 
-
-def log_sweep(folder: Path, config: Values) -> None:
-    """Log a sweep's folder, likewise, with the configuration of its first job."""
+    A failing store costs a line of warning; every result is on disk.
+    """
     outputs = Path(config["paths"]["outputs"])
     try:
-        _log(folder, outputs, config)
+        if (folder / RESULT).is_file() or (folder / PLAN).is_file():
+            _log(folder, outputs, config)
     except (MvestError, OSError) as error:
         remedy = f"every result is on disk, and `mvest sync {outputs}` logs what is missing"
         print(f"warning: {error}; {remedy}", file=sys.stderr)
 
 
 def sync(outputs: Path) -> int:
-    """Bring the stores to the state of a folder of outputs; 1 if something was left out, else 0."""
+    """Log everything in a folder of outputs that its store lacks; 1 if a file was unreadable."""
     counts, swept = Counter[str](), set[Path]()
     for path in [*sorted(outputs.rglob(PLAN)), *sorted(outputs.rglob(RESULT))]:
         try:
@@ -185,51 +171,72 @@ def sync(outputs: Path) -> int:
 
 
 def _left_out(path: Path, error: Exception) -> int:
-    tqdm.write(f"warning: {path} left out: {error}", file=sys.stderr)
+    say(f"warning: {path} left out: {error}")
     return 1
 
 
+class Entry(NamedTuple):
+    """A run for MLflow.
+
+    Attributes
+    ----------
+    result : Path
+    name : str
+    tags : mapping
+        The first one identifies the run.
+    settings : mapping
+    numbers : mapping
+        Metrics.
+    seconds : float
+    """
+
+    result: Path
+    name: str
+    tags: Values
+    settings: Values
+    numbers: dict[str, float]
+    seconds: float
+
+
 def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
-    """Log a run by itself, or a sweep as one run with its jobs below it; counts what was done."""
+    """Log a single run, or a sweep as a run with its jobs as children; counts them."""
     counts, name, tracking = Counter[str](), str(config["name"]), config["tracking"]
     if not tracking["enabled"]:
         return counts
-    is_sweep = (folder / PLAN).is_file()
-    alone = [] if is_sweep else [{"folder": "", "overrides": _typed(folder), "factors": {}}]
-    plan: dict[str, Any] = read_mapping(folder / PLAN) if is_sweep else {"jobs": alone}
-    each = len(plan["jobs"]) <= MANY
-    entries, rows, factors = [], [], []
-    for job in plan["jobs"]:
-        place = folder / job["folder"]
-        try:
-            if (place / RESULT).is_file():
-                own = read_mapping(place / CONFIG)
-                entries.append(_job(place, job.get("name")) if each else None)
-                rows.append(settings_of(own, job["overrides"]))
-                factors.append(job["factors"])
-        except MvestError as error:
-            counts["left"] += _left_out(place, error)
-    with opened(tracking["uri"], outputs, name):
-        known = runs_of(name, "" if is_sweep else f"tags.folder = '{folder.resolve().name}'")
-        parent, shown = None, zip(entries, varied(rows, factors), strict=True)
-        if is_sweep:
-            parent, done = _put(_sweep(folder, plan), together(rows), known, None)
+    plan: Any = read_mapping(folder / PLAN) if (folder / PLAN).is_file() else None
+    jobs: Any = plan["jobs"] if plan else [{"folder": "", "overrides": _typed(folder)}]
+    shown = jobs if len(jobs) <= MANY else []
+    with (
+        PartBar(f"{name}, to MLflow", len(shown), "run") as bar,
+        opened(tracking["uri"], outputs, name),
+    ):
+        known = runs_of(name, "" if plan else f"tags.folder = '{folder.resolve().name}'")
+        parent = None
+        if plan:
+            parent, done = _put(_sweep(folder, plan), known, None)
             counts[done] += 1
-        for entry, row in tqdm(list(shown), "to MLflow", disable=None, leave=False):
-            if entry is not None:
-                counts[_put(entry, row, known, parent)[1]] += 1
+        for job in shown:
+            bar.step()
+            place = folder / job["folder"]
+            try:
+                if (place / RESULT).is_file() and (entry := _job(place, job)):
+                    counts[_put(entry, known, parent)[1]] += 1
+            except (MvestError, KeyError) as error:
+                counts["left"] += _left_out(place, error)
     return counts
 
 
 def _typed(folder: Path) -> list[str]:
-    """What was typed for a run by itself."""
+    """The overrides of a single run."""
     place = folder / TYPED
     return list(map(str, OmegaConf.load(place))) if place.is_file() else []
 
 
-def _job(folder: Path, name: str | None) -> Entry | None:
-    """A job; None before all of it is on disk."""
+def _job(folder: Path, job: Values) -> Entry | None:
+    """A job or single run; None while a file of it is missing."""
     record = read_record(folder / RESULT)
+    if record.converged and not is_done(folder):
+        return None
     source, why = record.provenance, implausible(record)
     tags = {
         "config_hash": source.config_hash,
@@ -239,8 +246,10 @@ def _job(folder: Path, name: str | None) -> Entry | None:
         "plausible": f"no: {why}" if why else "yes",
         "mlflow.source.git.commit": source.git.sha,
     }
-    entry = folder / RESULT, name or record.row, tags, metrics(record), record.seconds_total
-    return entry if is_done(folder) or not record.converged else None
+    config = read_mapping(folder / CONFIG)
+    settings = settings_of(config, job["overrides"], job.get("factors", {}))
+    name = job.get("name") or record.row
+    return Entry(folder / RESULT, name, tags, settings, metrics(record), record.seconds_total)
 
 
 def _sweep(folder: Path, plan: Values) -> Entry:
@@ -254,35 +263,34 @@ def _sweep(folder: Path, plan: Values) -> Entry:
         totals["failed"] = sum(not record.converged for record in sweep.records)
         totals["seconds"] = sum(record.seconds_total for record in sweep.records)
         tags["mlflow.source.git.commit"] = sweep.provenance.git.sha
-    return result, name, tags, totals, totals.get("seconds", 0.0)
+    return Entry(result, name, tags, {}, totals, totals.get("seconds", 0.0))
 
 
-def _put(entry: Entry, row: Values, known: list[Any], parent: str | None) -> tuple[str, str]:
+def _put(entry: Entry, known: list[Any], parent: str | None) -> tuple[str, str]:
     """Bring one run to the state of an entry; its id, and whether it was added."""
     import mlflow
 
-    result, name, tags, numbers, seconds = entry
-    key, digest, client = next(iter(tags)), sha256_of(result), mlflow.MlflowClient()
+    tags, digest, client = entry.tags, sha256_of(entry.result), mlflow.MlflowClient()
+    key = next(iter(tags))
     before = [run for run in known if run.data.tags.get(key) == tags[key]]
     same = [run for run in before if run.data.tags.get(WHOLE) == digest]
-    texts = {key: text_of(value) for key, value in row.items() if value is not None}
     if same:
-        run_id, data = same[0].info.run_id, same[0].data
-        mlflow.log_params({k: v for k, v in texts.items() if k not in data.params}, run_id=run_id)
-        if parent and data.tags.get(PARENT) != parent:
+        run_id = same[0].info.run_id
+        if parent and same[0].data.tags.get(PARENT) != parent:
             client.set_tag(run_id, PARENT, parent)
-            client.update_run(run_id, name=name)
+            client.update_run(run_id, name=entry.name)
     else:
-        about = {"mlflow.source.name": "mvest run", "folder": result.resolve().parent.name, **tags}
+        folder = entry.result.resolve().parent
+        about = {"mlflow.source.name": "mvest run", "folder": folder.name, **tags}
         about = {key: value for key, value in about.items() if value is not None}
-        with mlflow.start_run(run_name=name, parent_run_id=parent, tags=about) as run:
-            mlflow.log_params(texts)
-            mlflow.log_metrics(numbers, step=0)
-            for path in sorted(path for name in FILES for path in result.parent.glob(name)):
+        with mlflow.start_run(run_name=entry.name, parent_run_id=parent, tags=about) as run:
+            mlflow.log_params(entry.settings)
+            mlflow.log_metrics(entry.numbers, step=0)
+            for path in sorted(path for name in FILES for path in folder.glob(name)):
                 if path.name != PLAN and not path.name.startswith("."):
                     mlflow.log_artifact(str(path))
-        # Its duration is that of the computation; the hash comes last and says that it is whole.
-        run_id, end = run.info.run_id, run.info.start_time + int(1000 * seconds)
+        # Its duration is that of the computation. The hash comes last: the run is complete.
+        run_id, end = run.info.run_id, run.info.start_time + int(1000 * entry.seconds)
         ended = "FAILED" if tags.get("status") == "failed" else "FINISHED"
         client.set_terminated(run_id, ended, end)
         client.set_tag(run_id, WHOLE, digest)
@@ -300,15 +308,12 @@ def runs_of(experiment: str, chosen: str) -> list[Any]:
 
 
 def last_sweep(outputs: Path) -> tuple[str, str, str]:
-    """Of the sweep that was planned last: its store, the path of its page, and a line on it.
+    """Store of the sweep that was planned last, the path of its page, and a line about it.
 
-    The page compares the runs with a plausible answer. It lists them where they are too many, and
-    shows the sweep as a whole where there are none.
+    The page compares the plausible runs. It lists them if there are too many to compare, and shows
+    the sweep as a whole if there are none.
 
-    Raises
-    ------
-    InputError
-        If there is no sweep, or it has not been logged.
+    Raises an `InputError` if there is no sweep, or it has not been logged.
     """
     plans = sorted(outputs.glob(f"*/{PLAN}"), key=lambda path: path.stat().st_mtime)
     if not plans:
@@ -320,18 +325,18 @@ def last_sweep(outputs: Path) -> tuple[str, str, str]:
         if not whole:
             raise InputError(f"{sweep} is not in {place}; `mvest sync {outputs}` logs it")
         parent, experiment = whole[0].info.run_id, whole[0].info.experiment_id
-        jobs = f"tags.`{PARENT}` = '{parent}'"
-        chosen = f"{jobs} and tags.plausible = 'yes'"
-        runs, count = [run.info.run_id for run in runs_of(name, chosen)], len(runs_of(name, jobs))
+        jobs = runs_of(name, f"tags.`{PARENT}` = '{parent}'")
+    runs = [run.info.run_id for run in jobs if run.data.tags.get("plausible") == "yes"]
     page = f"/#/experiments/{experiment}/runs"
     if not runs:
         page += f"/{parent}"
     elif len(runs) > MOST:
+        chosen = f"tags.`{PARENT}` = '{parent}' and tags.plausible = 'yes'"
         page += f"?searchFilter={quote(chosen)}"
     else:
         ids, experiments = (quote(json.dumps(some)) for some in (runs, [experiment]))
         page = f"/#/compare-runs?runs={ids}&experiments={experiments}&workflowType=machine_learning"
-    left = f" ({count - len(runs)} failed or implausible)" if count > len(runs) else ""
+    left = f" ({len(jobs) - len(runs)} failed or implausible)" if len(jobs) > len(runs) else ""
     return place, page, f"{sweep}, {len(runs)} runs{left}"
 
 
@@ -339,12 +344,9 @@ def last_sweep(outputs: Path) -> tuple[str, str, str]:
 def serving(
     place: str, port: int, *, quiet: bool = False
 ) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """MLflow's server, for this machine only: its address, and its process, which ends with this.
+    """Run MLflow's server for this machine only; yields its address and its process.
 
-    Raises
-    ------
-    InputError
-        If the port is taken, or the server does not start.
+    Raises an `InputError` if the port is taken, or the server does not start.
     """
     try:
         with socket.create_server(("127.0.0.1", port)) as probe:
@@ -355,10 +357,10 @@ def serving(
     command += ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
     command += ["--allowed-hosts", ",".join(hosts := allowed_hosts(port))]
     command += ["--cors-allowed-origins", ",".join("http://" + host for host in hosts)]
-    # Whatever the login shell has set: nobody else is let in.
+    # Settings of the login shell must not let others in.
     own = {k: v for k, v in environment().items() if not k.startswith("MLFLOW_SERVER_")} | SERVED
     streams = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL if quiet else None)
-    # uvicorn looks for modules in the folder that it is started in.
+    # uvicorn looks for modules in its working folder.
     with Program(command, stdin=subprocess.DEVNULL, env=own, cwd="/", **streams) as server:
         until = time.monotonic() + 120.0  # s
         while server.process.poll() is None and time.monotonic() < until:
@@ -372,5 +374,5 @@ def serving(
 
 
 def allowed_hosts(port: int) -> list[str]:
-    """The hosts that a request may name; MLflow's own list lets names like 10.evil.com in."""
+    """The hosts that a request may name; MLflow's own list admits names like 10.evil.com."""
     return [f"{host}:{port}" for host in (HOST, "127.0.0.1", "localhost", "[::1]")]

@@ -53,5 +53,5 @@ STUDY = Study(
     run=run,
     words=case_words,
     files=write_report,
-    checks=lambda: (check_case,),
+    check=check_case,
 )

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -53,9 +53,6 @@ from mvest.simulation.virtual_patient import (
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 Row = dict[str, Any]
 
@@ -127,11 +124,21 @@ def _valve_designs(values: Values, settings: DesignsSettings) -> Result:
     units = dict.fromkeys(next(iter(rows), ()), "")
     units |= {name: "%" for name in units if name.startswith("std")}
     units |= {name: "mm" for name in units if name.startswith("noise")}
+    known = dict.fromkeys(settings.known, 0.0)
+    confounded = [
+        {key: about[key] for key in ("frames", "errors")}
+        | {
+            "changes that hardly show": ", ".join(
+                f"{name} {100 * v:+.2g} %"
+                for name, v in zip(group.parameters, group.relative, strict=True)
+            ),
+            "correlation": group.correlation,
+        }
+        for about, design in whole
+        for group in design.at(settings.typical_mm, known).confounded()
+    ]
     return Result(
-        tables={
-            "": table(rows, **units),
-            "confounded": table(_confounded(settings, whole)),
-        },
+        tables={"": table(rows, **units), "confounded": table(confounded)},
         numbers={"typical_mm": settings.typical_mm},
         mesh=Mesh.of(model.mesh),
         forward_solves=len(frames),
@@ -201,20 +208,6 @@ def _expected(settings: DesignsSettings, design: Design) -> Iterator[Row]:
             row[f"std at {mm:g} mm"] = finite(100 * design.std(name, mm, stds))
         needed = design.needed_noise(name, settings.target, stds)
         yield row | {f"noise for {100 * settings.target:g} %": finite(needed)}
-
-
-def _confounded(settings: DesignsSettings, designs: list[tuple[Row, Design]]) -> Iterator[Row]:
-    """Changes of parameters that compensate each other, if nuisances are unknown."""
-    for about, design in designs:
-        bound = design.at(settings.typical_mm, dict.fromkeys(settings.known, 0.0))
-        for group in bound.confounded():
-            moved = zip(group.parameters, group.relative, strict=True)
-            yield {
-                "frames": about["frames"],
-                "errors": about["errors"],
-                "changes that hardly show": ", ".join(f"{n} {100 * v:+.2g} %" for n, v in moved),
-                "correlation": group.correlation,
-            }
 
 
 # -- frames of a virtual patient ------------------------------------------------------------------
@@ -323,44 +316,34 @@ def _compared(
 
 
 # -- tables ---------------------------------------------------------------------------------------
+OBSERVATION = ["vertices", "errors", "frames"]
+PATIENT_DESIGN = {"geometry": "", "errors": "", "error": "mmHg", "known": ""}
+
+
 def summary(results: Results) -> dict[str, Table]:
     """A row for each observation, or the median over patients for each design."""
     rest = {name: results.table(name) for name in results.table_names if name}
-    if "left" not in results.table().values:
-        worse = _worse(results)
+    frame = results.table().frame
+    if "left" not in frame:
+        # The worse modulus at the typical noise; a missing value is an undetermined modulus.
+        column = f"std at {results.first.numbers['typical_mm']:g} mm"
+        keys = [*OBSERVATION, known := "knowledge of the nuisances"]
+        worst = frame.fillna({column: np.inf}).groupby(keys, sort=False)[column].max().unstack()
+        worse = worst.loc[:, frame[known].unique()]
         columns = dict.fromkeys(OBSERVATION, "") | dict.fromkeys(worse.columns, "%:.2g")
         return {"worse_modulus": table(worse.reset_index(), **columns), **rest}
-    medians = _medians(results).reset_index()
-    counts = {name: Column("%", ".0f") for name in medians.columns if name.endswith("closed")}
-    keys: dict[str, Column | str] = {"geometry": "", "errors": "", "error": "mmHg", "known": ""}
-    shown = {"median_left": table(medians, **keys, **counts), **rest}
+    # The remaining error of the guess, by number of frames.
+    groups = frame.groupby([*PATIENT_DESIGN, "frames"], sort=False)["left"]
+    medians = groups.median().unstack().rename(columns=lambda n: f"{n} closed")
+    counts = dict.fromkeys(medians.columns, "%:.0f")
+    shown = {"median_left": table(medians.reset_index(), **PATIENT_DESIGN, **counts), **rest}
     if "tried" in rest:
         values = list(TRIED)[2:]
         squares = rest["tried"].frame.dropna().set_index("design")[values].astype(float) ** 2
-        rms = np.sqrt(squares.groupby("design", sort=False).mean()).reset_index()
+        rms = (squares.groupby("design", sort=False).mean() ** 0.5).reset_index()
         about = {name: TRIED[name] for name in values}
         shown["root_mean_squares"] = table(rms, design="", **about)
     return shown
-
-
-OBSERVATION = ["vertices", "errors", "frames"]
-
-
-def _worse(results: Results) -> DataFrame:
-    """Standard deviation of the worse modulus at the typical noise, by knowledge of nuisances."""
-    frame, column = results.table().frame, f"std at {results.first.numbers['typical_mm']:g} mm"
-    known = "knowledge of the nuisances"
-    # A missing value is an undetermined modulus.
-    worse = frame.fillna({column: np.inf}).groupby([*OBSERVATION, known], sort=False)[column].max()
-    return worse.unstack().loc[:, frame[known].unique()]
-
-
-def _medians(results: Results) -> DataFrame:
-    """Remaining error of the guess, as median over patients and moduli, by number of frames."""
-    keys = ["geometry", "errors", "error", "known", "frames"]
-    frame = results.table().frame
-    medians = frame.groupby(keys, sort=False)["left"].median().unstack()
-    return medians.rename(columns=lambda n: f"{n} closed")
 
 
 STUDY = Study(settings=Settings, run=run, summary=summary)

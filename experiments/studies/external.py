@@ -258,14 +258,13 @@ def check_external(values: Values, folder: Path) -> str:
     if not found.converged:
         raise InputError(f"at the initial values: {found.reason}")
     distance = np.linalg.norm(found.y.reshape(-1, 3) - y, axis=1)
+    derivatives = "by differences, the program gives none"
     by: FloatArray | str = "it is a function"
-    if isinstance(model, ProcessModel):
-        by = model.by_differences(m, found.y) if model.own_jacobian else ""
-    if isinstance(by, str) and not by:
-        derivatives = "by differences, the program gives none"
-    elif isinstance(by, str):
+    if isinstance(model, ProcessModel) and model.own_jacobian:
+        by = model.by_differences(m, found.y)
+    if not isinstance(model, ProcessModel) or model.own_jacobian:
         derivatives = f"the model's own; not compared with differences: {by}"
-    else:
+    if not isinstance(by, str):
         off = np.linalg.norm(found.jacobian - by, axis=0) / np.linalg.norm(by, axis=0)
         each = zip(problem.parameters, off, strict=True)
         shares = ", ".join(f"{name} {100 * share:.2g} %" for name, share in each)
@@ -289,5 +288,5 @@ STUDY = Study(
     run=run,
     figure=figure,
     captions={"": "Parameters after each iteration, with each model."},
-    checks=lambda: (check_external,),
+    check=check_external,
 )

@@ -39,7 +39,7 @@ from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
-from mvest.exchange.segmentations import write_sequence_nrrd
+from mvest.exchange.volumes import write_sequence_nrrd
 from mvest.imaging.simulator.acquisition import Probe, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import ValveSequence
@@ -301,7 +301,8 @@ def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
         rows.append(row)
     bias = Column(digits=".2f", std="bias SE", label="mean error of the logarithm ± SE")
     slope = Column(digits=".2f", std="slope SE", label="slope over the truth's ± SE")
-    return table(rows, **{"estimated from": "", "n": "", "bias": bias, "slope": slope})
+    first = {"estimated from": Column(), "n": Column()}
+    return table(rows, **first, bias=bias, slope=slope)
 
 
 def _chordae(results: Results) -> Table:

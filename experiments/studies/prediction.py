@@ -186,7 +186,7 @@ def _patient(
     rng = np.random.default_rng(seed)
     spread = np.array(settings.spread, dtype=float)
     truth = np.asarray(twin.truth_values * np.exp(spread * rng.standard_normal(len(spread))))
-    data = twin.observe(twin.source, truth, rng)
+    data = twin.observe(twin.source, values=truth, rng=rng)
     step()
     if data.observation is None:
         return StudyResult.failed(twin.problem, data.reason), {}

@@ -50,5 +50,5 @@ STUDY = Study(
     run=run,
     words=case_words,
     files=write_report,
-    checks=lambda: (check_volume,),
+    check=check_volume,
 )

@@ -1,7 +1,4 @@
-"""A collected sweep: ``sweep.json`` of the runner, ``results/sweeps/NAME.json`` when published.
-
-A job is its record, without tables, and what the runner knows of it besides.
-"""
+"""A collected sweep: ``sweep.json`` of a run, ``results/sweeps/NAME.json`` when published."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ SWEEPS = "sweeps"
 NOT_KEPT: dict[str, Any] = {
     "detail": "", "frames": (), "condition_number": None, "distance_to_truth_mm": None,
 }  # fmt: skip
-"""Parts of an estimate left out of a sweep, besides details; the job's own record has them."""
+"""Parts of an estimate that only the job's own record has."""
 
 
 class SweptJob(Frozen):
@@ -36,7 +33,7 @@ class SweptJob(Frozen):
     hash : str
         First digits of the hash of its configuration.
     seed, repeats : int
-        It runs with the seeds ``seed``, ``seed + 1``, ..., so many in all.
+        Its seeds are ``seed``, ..., ``seed + repeats - 1``.
     record : Record
         Its head, see `head_of`.
     """
@@ -48,7 +45,7 @@ class SweptJob(Frozen):
 
     @property
     def runs(self) -> tuple[EstimateRecord, ...]:
-        """A run for each planned seed; one that left no estimate failed for the job's reason."""
+        """An estimate for each planned seed; a missing one has failed for the job's reason."""
         record, known = self.record, {one.seed for one in self.record.estimates}
         unknowns = tuple(Unknown(name=name, unit=unit_of(name)) for name in record.parameters)
         lost = [
@@ -69,7 +66,7 @@ class Sweep(Frozen):
     name, size, title : str
     parameters : tuple of str, (p,)
     paper : mapping or None
-        What the paper reports of the same experiment: ``table``, ``estimate``, ``error_percent``.
+        The paper's results: ``table``, ``estimate``, ``error_percent``.
     provenance : Provenance
         Of the process that collected the jobs; its configuration hash is that of all jobs.
     commits : tuple of str
@@ -93,7 +90,7 @@ class Sweep(Frozen):
 
     @property
     def factors(self) -> list[str]:
-        """Names of everything varied, in the order in which the jobs bring them up."""
+        """Names of everything varied, in the order of the jobs."""
         return list(dict.fromkeys(name for job in self.jobs for name in job.record.factors))
 
     @property
@@ -103,7 +100,7 @@ class Sweep(Frozen):
 
 
 def head_of(record: Record) -> Record:
-    """What a sweep keeps of a job's record: no tables, and of estimates what sweeps show."""
+    """The part of a job's record that a sweep needs: no tables, no details of estimates."""
     estimates = tuple(
         one.without_details().model_copy(
             update={**NOT_KEPT, "unknowns": tuple(u for u in one.unknowns if u.kind != "derived")}
@@ -114,12 +111,9 @@ def head_of(record: Record) -> Record:
 
 
 def write_sweep_file(path: Path, sweep: Sweep) -> None:
-    """Write a collected sweep with a digest of its content, whole or not at all.
+    """Write a collected sweep with a digest of its content, atomically.
 
-    Raises
-    ------
-    InputError
-        If it cannot be written.
+    Raises an `InputError` if it cannot be written.
     """
     jobs = [job.model_dump(mode="json", exclude_defaults=True) for job in sweep.jobs]
     content = sealed({**sweep.model_dump(mode="json", exclude={"jobs"}), "jobs": jobs})
@@ -130,10 +124,7 @@ def write_sweep_file(path: Path, sweep: Sweep) -> None:
 def read_sweep(path: Path) -> Sweep:
     """The collected sweep in a file.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, is no sweep of this version, or is not as it was written.
+    Raises an `InputError` if it cannot be read, is no sweep of this version, or was changed.
     """
     data = read_mapping(path)
     sweep = validated(Sweep, {k: v for k, v in data.items() if k != "sha256"}, str(path))

@@ -34,16 +34,16 @@ SPAN = 10.0
 """Ratio of values from which an axis is logarithmic."""
 
 MOST_PANELS, MOST_CELLS = 4, 16
-"""Values of a factor that panels may part, and cells of such panels in one row."""
+"""Most values of a factor that get a panel each, and most cells of panels in one row."""
 
 TICKS, SHORT, LINE = 8, 8, 18
-"""Values named at an axis, characters of a name that stands upright, and of a line of another."""
+"""Most tick labels, characters of a label that is not rotated, and of a line of a label."""
 
 Values = dict[str, list[Any]]
 
 
 def figures_of(sweep: Sweep) -> dict[str, Figure]:
-    """The figures of a sweep by the end of their file names; those without data are left out.
+    """The figures of a sweep by the end of their file names, if there are data.
 
     ``""`` shows errors and intervals along each factor, ``matrix`` errors over two factors.
     """
@@ -89,7 +89,7 @@ def _along(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
 def _panel(
     axes: Any, sweep: Sweep, runs: DataFrame, column: str, values: Sequence[Any]
 ) -> list[float]:
-    """Draw one factor; returns how far errors and intervals reach at each of its values."""
+    """Draw one factor; returns the largest errors or intervals at each of its values."""
     places = _places(values)
     gap, count = float(np.diff(places).min()), len(sweep.parameters)
     reach = []
@@ -128,9 +128,9 @@ def _panel(
 
 
 def _places(values: Sequence[Any]) -> FloatArray:
-    """Where values stand: names beside each other, numbers at their value or its logarithm.
+    """Positions of values: names evenly spaced, numbers at their value or its logarithm.
 
-    Logarithms where they are more evenly spaced; a zero then stands one decade below the others.
+    Logarithms are used if they are more evenly spaced; a zero is then one decade below the others.
     """
     if not is_number(values):
         return np.arange(len(values), dtype=np.float64)
@@ -144,7 +144,7 @@ def _places(values: Sequence[Any]) -> FloatArray:
 
 
 def _matrix(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
-    """Largest error of a parameter over the two factors of which most values were combined."""
+    """Error of the worst parameter over the two factors with the most combinations of values."""
     if len(values) < 2:
         return None
     up, across = max(combinations(values, 2), key=lambda pair: runs[[*pair]].value_counts().size)
@@ -191,7 +191,7 @@ def _matrix(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
 
 
 def _parted(values: Values, but: Sequence[str]) -> tuple[str, list[Any]]:
-    """The factor that parts panels, rather names than numbers, and its values; or "" and None."""
+    """The factor with a panel for each value, names before numbers, and its values; or "", None."""
     few = [name for name in values if name not in but and len(values[name]) <= MOST_PANELS]
     chosen = min(few, key=lambda name: is_number(values[name]), default="")
     return chosen, values.get(chosen, [None])

@@ -1,7 +1,7 @@
-"""Files of a sweep: its runs as a tidy table, statistics of them by setting, figures, a page.
+"""Files of a sweep: its runs as a tidy table, statistics by setting, figures, a page.
 
-They follow from the collected sweep alone (``results/sweeps/NAME.json``) and not from when or where
-a run was made, so that equal results give equal files.
+They follow from the collected sweep alone, not from when or where a run was made. So equal results
+give equal files.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments.common.progress import WIDTH
 from experiments.common.records.writer import LONGEST, write_page
 from experiments.sweeps.collected import Sweep
 from mvest.errors import InputError
@@ -31,22 +32,22 @@ SEED = "seed"
 """A factor of this name is a repetition and no setting."""
 
 MOST_SETTINGS = 150
-"""If there are more settings than this, each with a single run, numbers count as repetitions."""
+"""With more settings of a single run each, different numbers count as repetitions."""
 
 Z95 = 1.959963984540054
 """97.5 % quantile of the normal distribution."""
 
 ENDINGS = {"mm": "mm", "mpa": "MPa", "mmhg": "mmHg", "s": "s", "percent": "%"}
-"""Endings of factor names that say a unit."""
+"""Endings of factor names that state a unit."""
 
 COVARIANCE = "filter coordinates²"
 """Filter coordinates are MPa, or logarithms where the filter works in them."""
 
 UNIT, BOUND, ERROR = "unit of the parameter", "Cramér–Rao bound", "signed error"
-"""A unit that differs from row to row where parameters do, and two columns."""
+"""A unit that may differ from row to row, and two columns."""
 
 COVARIANCES = {"P0": COVARIANCE, "Q": COVARIANCE, "R": "mm²"}
-"""Factors whose unit no ending says."""
+"""Units of factors without such an ending."""
 
 COLUMNS = {
     **dict.fromkeys(("job", "seed", "status", "parameter"), ""), "true value": UNIT, "start": UNIT,
@@ -61,7 +62,7 @@ RENAMED = {
     "distance_mean": "distance mean", "distance_std": "distance SD",
     "distance_max": "distance max", "forward_solves": "forward solves",
 }  # fmt: skip
-"""Columns that have another name in the rows of a record (`EstimateRecord.rows`)."""
+"""Columns of `EstimateRecord.rows` -> their names here."""
 
 STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
     "estimate": (
@@ -91,8 +92,7 @@ STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
     "forward solves, median": (Column(hidden=True), lambda good: good["forward solves"].median()),
     "forward solves, max": (Column(hidden=True), lambda good: good["forward solves"].max()),
 }  # fmt: skip
-"""Column -> what it is and how it follows from the runs of a setting that did not fail."""
-
+"""Column -> its meaning, and its value for the converged runs of a setting."""
 
 CAPTIONS = {
     "": "Errors and intervals along each factor.",
@@ -102,7 +102,7 @@ CAPTIONS = {
 
 
 SHOWN = ("setting", "parameter", "runs", "failed", "estimate", "median error", "largest error")
-"""Columns of the table by settings that a terminal has room for."""
+"""Columns of the table by settings for a terminal."""
 
 
 def factors_of(sweep: Sweep) -> dict[str, tuple[str, str]]:
@@ -122,8 +122,8 @@ def factors_of(sweep: Sweep) -> dict[str, tuple[str, str]]:
 def runs_of(sweep: Sweep) -> Table:
     """A row for each parameter of each run (job and seed), failed ones included, factors first.
 
-    Errors are signed, in percent of the truth. The ends of an interval are those that the record
-    states, or 1.96 standard deviations from the estimate. Of a lost run only its factors are known.
+    Errors are signed, in percent of the truth. An interval that the record does not state is the
+    estimate ± 1.96 standard deviations. Of a lost run only its factors are known.
     """
     factors = factors_of(sweep)
     units = {**dict(factors.values()), **COLUMNS}
@@ -137,7 +137,7 @@ def runs_of(sweep: Sweep) -> Table:
 
 
 def _table(sweep: Sweep, rows: list[dict[str, Any]], about: dict[str, Column]) -> Table:
-    """A table of these columns; where all parameters have one unit it stands at the columns."""
+    """A table of these columns, with the unit of the parameters if they have only one."""
     units = {unit_of(name) for name in sweep.parameters}
     if len(units) == 1:
         unit = units.pop()
@@ -157,7 +157,7 @@ def _cells(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def shortened(whole: Table) -> Table:
-    """Ten significant digits of every number; each text in one line, as simple readers need it."""
+    """The table with ten significant digits of every number, and each text in one line."""
 
     def short(value: Any) -> Any:
         if isinstance(value, float):
@@ -169,14 +169,14 @@ def shortened(whole: Table) -> Table:
 
 
 def good_of(runs: DataFrame) -> DataFrame:
-    """The rows of runs that converged to an estimate, with numbers as floats."""
+    """The rows of converged runs, with numbers as floats."""
     numbers = [name for name in runs if COLUMNS.get(str(name)) in (UNIT, "%", "mm")]
     good = runs[(runs["status"] == CONVERGED) & runs["estimate"].notna()]
     return good.astype(dict.fromkeys([*numbers, "forward solves"], float))
 
 
 def values_of(sweep: Sweep, runs: DataFrame) -> dict[str, list[Any]]:
-    """Column of each factor that takes several values -> these, numbers in increasing order."""
+    """Column of each varied factor -> its values, numbers in increasing order."""
     found = {}
     for name, (column, _) in factors_of(sweep).items():
         values = list(dict.fromkeys(runs[column].dropna()))
@@ -191,10 +191,10 @@ def is_number(values: Sequence[Any]) -> bool:
 
 
 def by_setting(sweep: Sweep) -> Table:
-    """Statistics of each parameter in each setting, below the paper's numbers if it has any.
+    """Statistics of each parameter in each setting, below the paper's numbers if there are any.
 
-    Runs that failed are counted and enter no other number. Where there are very many settings with
-    a single run each, runs that differ in numbers only are counted as repetitions of a setting.
+    Failed runs are counted and enter no other number. If there are very many settings with a single
+    run each, runs that differ only in numbers count as repetitions of a setting.
     """
     runs = runs_of(sweep).frame
     units = {column: unit for name, (column, unit) in factors_of(sweep).items() if name != SEED}
@@ -231,7 +231,7 @@ def by_setting(sweep: Sweep) -> Table:
 
 
 def _words(run: Series[Any], names: Sequence[str], units: Mapping[str, str]) -> str:
-    """A run's values of some factors: a text as it is, a number with its name and unit."""
+    """A run's values of some factors: texts, and numbers with name and unit."""
     words = []
     for name in names:
         value, unit = run[name], units.get(name, "")
@@ -244,7 +244,7 @@ def _words(run: Series[Any], names: Sequence[str], units: Mapping[str, str]) -> 
 
 
 def _statistics(runs: DataFrame) -> dict[str, Any]:
-    """Numbers of a parameter in a group of runs; NaN or None where there is nothing to take."""
+    """Numbers of a parameter in a group of runs; NaN or None without converged runs."""
     good = good_of(runs)
     lost = runs.drop(good.index)["reason"]
     # Without the numbers of the filter's check.
@@ -262,7 +262,7 @@ def _rms(values: Series[Any]) -> float:
 
 
 def _coverage(good: DataFrame) -> tuple[float | None, float | None, float | None]:
-    """Share (%) of intervals that contain the truth, and Wilson's 95 % interval of it."""
+    """Share (%) of intervals that contain the truth, and its 95 % interval (Wilson)."""
     from scipy.stats import binomtest
 
     low, truth, high = good[["low", "true value", "high"]].dropna().to_numpy(dtype=np.float64).T
@@ -274,31 +274,25 @@ def _coverage(good: DataFrame) -> tuple[float | None, float | None, float | None
 
 
 def text_of(sweep: Sweep) -> str:
-    """The table of a sweep for a terminal: what was estimated in each setting, and how well."""
-    # Imports for a second.
+    """The table of a sweep for a terminal, at most 100 characters wide."""
     from pandas import DataFrame
 
     table = by_setting(sweep)
     if len(table) > LONGEST:
         return f"{len(table)} settings and parameters: too many for a terminal"
     shown = {name: table.values[name] for name in (*SHOWN, "SD over runs")}
-    return str(DataFrame(replace(table, values=shown).readable()).to_string(index=False))
+    label = {"estimate": replace(table.columns["estimate"], label="estimate ± SD")}
+    readable = replace(table, values=shown, columns={**table.columns, **label}).readable()
+    return str(DataFrame(readable).to_string(index=False, line_width=WIDTH))
 
 
 def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
-    """Write the tables and figures of one sweep; returns their paths.
+    """Write the tables and figures of one sweep into an existing folder; returns their paths.
 
-    Parameters
-    ----------
-    results : Path
-        Existing folder; gets ``sweep_NAME.csv`` (a row for each run), ``sweep_NAME_table.csv`` and
-        ``.tex`` (a row for each setting), the page ``sweep_NAME.md`` and figures.
-    sweep : Sweep
+    ``sweep_NAME.csv`` has a row for each run, ``sweep_NAME_table.csv`` and ``.tex`` a row for each
+    setting, ``sweep_NAME.md`` is the page.
 
-    Raises
-    ------
-    InputError
-        If its name is none for a file, or a file cannot be written.
+    Raises an `InputError` if its name cannot name a file, or a file cannot be written.
     """
     if not re.fullmatch(r"[\w-]+", sweep.name):
         raise InputError(f"a sweep's name must be letters, digits, - and _, not {sweep.name!r}")

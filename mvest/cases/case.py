@@ -97,18 +97,10 @@ def check_frames(frames: Sequence[Any], wrong: Callable[[str, str], InputError])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """Errors of the observed vertices.
+    """Errors of the observed vertices."""
 
-    Attributes
-    ----------
-    std_mm : float or (n,) ndarray
-        Standard deviation of each coordinate, of all vertices or of each vertex.
-    correlation_length_mm : float
-        Correlation length of errors along the leaflets; 0: independent.
-    """
-
-    std_mm: float | FloatArray
-    correlation_length_mm: float = 0.0
+    std_mm: float | FloatArray  #: of each coordinate, of all vertices or of each vertex (n,)
+    correlation_length_mm: float = 0.0  #: along the leaflets; 0: independent
 
     def __post_init__(self) -> None:
         std = np.array(self.std_mm, dtype=np.float64)
@@ -141,21 +133,14 @@ class ErrorSamples:
     lengths of its chordae) are not observation noise: they change what is predicted. Each sample is
     one possible error of all frames together.
 
-    Attributes
-    ----------
-    vertices : (K, f, n, 3) mm
-        Displacement from the observed to the true position of each vertex, in each frame of the
-        case, in the axes of the case. The annulus and the free edge move with their vertices.
-    tips : (K, f, t, 3) mm
-        The same of the papillary tips.
-    source : (K,) or None
-        Number of each sample's source. Samples of one source, such as an error and its mirror
-        image, depend on each other. None: all are independent.
+    Samples of one source, such as an error and its mirror image, depend on each other.
     """
 
+    #: (K, f, n, 3) mm, from the observed to the true position of each vertex in each frame of the
+    #: case, in the axes of the case. Annulus and free edge move with their vertices.
     vertices: FloatArray
-    tips: FloatArray
-    source: IntArray | None = None
+    tips: FloatArray  #: (K, f, t, 3) mm, the same of the papillary tips
+    source: IntArray | None = None  #: (K,) number of each sample's source; None: all independent
 
     def __post_init__(self) -> None:
         for name in ("vertices", "tips"):

@@ -149,9 +149,8 @@ def _anatomy(case: ValveCase) -> Iterator[Value]:
 
 def _leaflets(case: ValveCase) -> dict[str, IntArray]:
     """Triangles ``(m, 3)`` of each leaflet."""
-    surface = case.surface
-    names = enumerate(surface.region_names)
-    return {name: surface.triangles[surface.region == number] for number, name in names}
+    names, triangles = enumerate(case.surface.region_names), case.surface.triangles
+    return {name: triangles[case.surface.region == number] for number, name in names}
 
 
 def _leaflet_lengths(case: ValveCase) -> dict[str, float]:

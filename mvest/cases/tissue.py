@@ -83,7 +83,10 @@ def _thickness(
     thinning = TemplateParameters().leaflets.edge_thinning
     missing = [name for name in names if name not in by_name]
     if missing:
-        raise InputError(f"none for the region {', '.join(missing)}; give one in mm")
+        raise InputError(
+            f"none for the region {', '.join(missing)}; give one in mm, or name the regions "
+            "anterior and posterior (not Anterior, AML or PML)"
+        )
     unknown = [name for name in by_name if name not in names]
     if given is None:
         listed = ", ".join(f"{by_name[name]:g} mm ({name})" for name in names)

@@ -155,8 +155,8 @@ class CycleModel:
     def run(self, m: FloatArray, *, sensitivities: bool = True) -> Simulation:
         """Run the cycle with parameters ``m (p,)`` from the open valve at rest.
 
-        ``sensitivities`` says whether all frames are differentiated. Raises MaterialError if a
-        modulus is inadmissible.
+        All frames are differentiated with ``sensitivities``. Raises MaterialError if a modulus is
+        inadmissible.
         """
         own, (system, parameters) = self.closure, self.closure.tuned(m)
         return simulate(

@@ -1,4 +1,4 @@
-"""Several closed frames of one valve as one prediction, each under a pressure of its own.
+"""Several closed frames of one valve as one prediction, each under its own pressure.
 
 All frames share the tissue, the chordae and everything else. Each frame is the equilibrium under
 its own pressure, annulus and papillary tips, reached from the one before it. A stated pressure P in
@@ -159,8 +159,7 @@ class FramesModel:
         if not self.errors:
             return by_closure
         at = self.model.names.index(SCALE)
-        # The true pressure is scale * unscaled; the closure has a factor of its own on another
-        # product.
+        # The true pressure is scale * unscaled; the closure's factor is that of `of_closure`.
         unscaled = self._unscaled(m, frame, stated)
         whole = np.zeros((len(by_closure), len(m)))
         whole[:, : by_closure.shape[1]] = by_closure

@@ -164,7 +164,7 @@ class ClosureModel:
         return {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
 
     def damping(self, m: FloatArray) -> Damping:
-        """The damping with parameters ``m (p,)``, of which it may be one."""
+        """The damping with parameters ``m (p,)``; it may be one of them."""
         own = self.settings.damping
         return replace(own, beta=self._values(m).get("damping", own.beta))
 
@@ -197,7 +197,7 @@ class ClosureModel:
         """Forget everything but ``closed``, from which the next closure may be continued.
 
         Later results depend on ``closed`` alone, to the last bit: the sparsity pattern and the
-        order of elimination, which follow the contact so far, begin anew.
+        order of elimination, which depend on contact so far, are reset.
         """
         self._closed = None if closed is None else replace(closed, guide=None)
         if self._system is not None:
@@ -291,11 +291,15 @@ class ClosureModel:
                 )
                 if simulation.converged:
                     break
-        if straight and self.guide is not None and unsettled(simulation):
-            guided = self._guided(self.guide, m)
-            if guided is not None:
-                resting = _resting(end, steps[-1].time)
-                simulation = run(resting, initial_positions=guided, initial_time=end)
+        guide = self.guide if straight and unsettled(simulation) else None
+        if guide is not None and self._in_guide is not None:
+            coarse = guide.close(m, sensitivities=False).simulation
+            if coarse.converged:
+                simulation = run(
+                    _resting(end, steps[-1].time),
+                    initial_positions=self._in_guide(coarse.frames[-1]),
+                    initial_time=end,
+                )
         if simulation is None or unsettled(simulation):
             start = None if self.perturbation is None else self.mesh.nodes + self.perturbation
             simulation = run(steps, initial_positions=start)
@@ -313,13 +317,6 @@ class ClosureModel:
             return embed(self.guide.mesh, self.mesh.nodes)
         except GeometryError:
             return None
-
-    def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
-        """The guide's closed state at this mesh's nodes ``(n, 3)``; None without one."""
-        if self._in_guide is None:
-            return None
-        simulation = guide.close(m, sensitivities=False).simulation
-        return self._in_guide(simulation.frames[-1]) if simulation.converged else None
 
     def rests(
         self,
@@ -374,8 +371,8 @@ class ClosureModel:
     ) -> Simulation:
         """Equilibrium under constant loads from nodal positions ``start (n, 3)``.
 
-        It is sought at once, or, if that fails or ``damped``, after some steps of time: damping
-        helps leaflets to slide over each other.
+        It is solved at once, or, if that fails or ``damped``, after some time steps: damping helps
+        leaflets to slide over each other.
         """
         assert self._system is not None
         end = self.settings.protocol.end

@@ -143,7 +143,7 @@ def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
         If the case needs another mesh or other contact samples, which only an anatomy can give.
     """
     if case.remeshed:
-        raise InputError(f"gate case {case.name!r} needs the anatomy to be meshed or sampled anew")
+        raise InputError(f"gate case {case.name!r} needs another mesh or other contact samples")
     fresh, settings = model.fresh(), model.settings
     protocol, newton, contact = settings.protocol, settings.newton, settings.contact
     tolerance = newton.tolerance if case.converged_path else newton.path_tolerance

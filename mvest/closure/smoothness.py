@@ -210,20 +210,15 @@ def follow(
         reason = failure(middle)
         waiting += [(middle, high), (low, middle)]
     path = Path(name, tuple(pieces), tried, reason)
-    return replace(path, reason=reason or _overall(path))
-
-
-def _overall(path: Path) -> str:
-    """Why pieces that pass one by one fail together; empty if they pass."""
-    for left, right in pairwise(path.pieces):
-        if min(left.share, right.share) > SIDE_LIMIT:
-            return (
+    for left, right in pairwise(pieces):
+        if not reason and min(left.share, right.share) > SIDE_LIMIT:
+            reason = (
                 f"the derivative at {_percent(left.high)} explains neither side: "
                 f"{100 * left.share:.2g} and {100 * right.share:.2g} % of the motion are left"
             )
-    if path.share > SLOPE_LIMIT:
-        return f"the derivatives do not explain {100 * path.share:.2g} % of the whole motion"
-    return ""
+    if not reason and path.share > SLOPE_LIMIT:
+        reason = f"the derivatives do not explain {100 * path.share:.2g} % of the whole motion"
+    return replace(path, reason=reason)
 
 
 def _share(part: float, whole: float) -> float:

@@ -49,10 +49,9 @@ class ApproximationCheck:
     ----------
     compared : str
         What was compared.
-    value : float
-        The difference; infinite if it could not be computed.
-    limit : float
-        Largest value at which the estimate's interval is valid.
+    value, limit : float
+        The difference, infinite if it could not be computed; the estimate's interval is valid up to
+        the limit.
     runs : int
         Runs of the model that were compared.
     """

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -91,8 +92,7 @@ class LearnedNoise:
     covariance: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Posterior:
+class Posterior(NamedTuple):
     """Mode, mean and a root of the covariance of coordinates u."""
 
     mode: FloatArray
@@ -107,16 +107,10 @@ class Evidence:
 
     Attributes
     ----------
-    family : NoiseFamily
-    prior : Gaussian
-        Of log θ.
-    root : (h, h)
     rows : (r, 1 + p + q)
         Innovation, columns of the parameters, and added columns.
-    kind : (r,)
-        Index of each row's variance.
-    count : (v,)
-        Observations with each variance, for the determinant.
+    kind, count : (r,), (v,)
+        Index of each row's variance, and number of observations with each variance.
     added : list of (int, slice)
         Index of a quantity, and the columns of which it is the factor.
     log_scale : float
@@ -274,23 +268,26 @@ def _quantities(
     family: NoiseFamily, prior: Gaussian, posterior: Gaussian
 ) -> tuple[LearnedQuantity, ...]:
     """The quantities of a family for a reader."""
+
+    def with_resolution(of: Gaussian, k: int, least: float) -> LogNormal:
+        variance = np.exp(2.0 * of.mean[k])
+        factor = np.exp(of.std[k] * variance / (variance + least))
+        return LogNormal(float(np.sqrt(variance + least)), float(factor))
+
     quantities, first = [], 0
     basis = next((block.basis for block in family.blocks if block.basis is not None), None)
     if basis is not None:
         first = BANDS
         for name, amount in _amounts(basis).items():
-            two = (_log_normal(amount, of.mean, of.covariance) for of in (prior, posterior))
-            quantities.append(LearnedQuantity(name, *two))
+            before = _log_normal(amount, prior.mean, prior.covariance)
+            after = _log_normal(amount, posterior.mean, posterior.covariance)
+            quantities.append(LearnedQuantity(name, before, after))
     factors = {block.frame for block in family.blocks} | {c.name for c in family.columns}
     rough = {block.rough for block in family.blocks}
     for k, name in enumerate(family.names[first:], first):
         least = family.resolution**2 if name in rough else 0.0
-        two = []
-        for of in (prior, posterior):
-            variance = np.exp(2.0 * of.mean[k])
-            factor = np.exp(of.std[k] * variance / (variance + least))
-            two.append(LogNormal(float(np.sqrt(variance + least)), float(factor)))
-        quantities.append(LearnedQuantity(name, *two, name in factors))
+        before, after = (with_resolution(of, k, least) for of in (prior, posterior))
+        quantities.append(LearnedQuantity(name, before, after, name in factors))
     return tuple(quantities)
 
 

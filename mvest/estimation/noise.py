@@ -241,12 +241,8 @@ class ErrorColumns:
 class VarianceTerms(NamedTuple):
     """Terms of the variances f² (s_b² w + τ² + δ²) along and across the bases of all blocks.
 
-    Attributes
-    ----------
-    weight : (r,)
-        w; for each block along its basis, then across it.
-    band, rough, frame : (r,)
-        Indices of the quantities s_b, τ and f; -1 without f.
+    ``weight (r,)`` is w; ``band``, ``rough`` and ``frame (r,)`` are the indices of the quantities
+    s_b, τ and f, -1 without f.
     """
 
     weight: FloatArray

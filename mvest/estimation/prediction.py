@@ -150,8 +150,8 @@ def of_some(
 ) -> Callable[[FloatArray], Prediction]:
     """A model as a function of its parameters ``kept (k,)``; the others stay at ``values (p,)``.
 
-    A parameter within the relative distance ``snap`` of its value is set to it, so that a run of
-    `SharedStart` or `Remembered` is found again.
+    A parameter within the relative distance ``snap`` of its value is set to it, so that
+    `SharedStart` recognises its start.
     """
 
     def part(m: FloatArray) -> Prediction:
@@ -169,13 +169,8 @@ def of_some(
 class Remembered:
     """A model that runs once for each parameter vector.
 
-    Attributes
-    ----------
-    model : ObservationModel
-    runs : list of ((p,), Prediction)
-        Runs so far, failed ones included.
-    rtol : float
-        Parameters within this relative distance are the same.
+    ``runs`` are pairs of parameters (p,) and predictions so far, failed ones included. Parameters
+    within the relative distance ``rtol`` are the same.
     """
 
     def __init__(
@@ -187,7 +182,7 @@ class Remembered:
         self.model, self.runs, self.rtol = model, list(runs), rtol
 
     def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict, as an `ObservationModel` does."""
+        """Predict once."""
         for at, prediction in self.runs:
             if np.allclose(at, m, rtol=self.rtol, atol=0.0):
                 return prediction

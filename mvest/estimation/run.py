@@ -31,22 +31,13 @@ class FilterRun:
 
     Attributes
     ----------
-    model : ObservationModel
-    physical_prior : Gaussian
-        Prior of the parameters themselves.
-    R : NoiseCovariance
-        As given.
-    prior : Gaussian
-        Prior in filter coordinates.
+    model, y, R, noise, transform, names
+        The problem, checked; ``noise`` is R factorised.
+    physical_prior, prior, unit : Gaussian
+        Prior of the parameters themselves and in filter coordinates, and N(0, I).
     L : (p, p)
-        Root of its covariance. With z = m + L x the prior of x is N(0, I), also if the prior holds
-        a parameter fixed.
-    unit : Gaussian
-        N(0, I) of p parameters.
-    y : (n,) in units of the observation
-    noise : ObservationNoise
-    transform : Transform
-    names : tuple of str, (p,)
+        Root of the prior's covariance. With z = m + L x the prior of x is N(0, I), also if the
+        prior holds a parameter fixed.
     forward_solves : int
     """
 
@@ -197,20 +188,10 @@ class FilterRun:
         samples: FloatArray | None = None,
         checks: Sequence[ApproximationCheck] = (),
     ) -> Estimate:
-        """Run the model at the estimate N(z, P), record it, and finish.
+        """Run the model at the estimate N(z, P) in filter coordinates, record it, and finish.
 
-        Parameters
-        ----------
-        z, P : (p,), (p, p)
-            In filter coordinates.
-        slope : (n, p)
-            dh/dz between the filter's points, used if the model has no derivative.
-        reason, detail
-            See `Estimate`.
-        samples : (s, p), optional
-            Draws from the posterior in filter coordinates; only ``checks`` then apply to it.
-        checks : sequence of ApproximationCheck
-            The filter's own.
+        ``slope (n, p)`` is dh/dz between the filter's points, used if the model has no derivative.
+        ``checks`` are the filter's own; to ``samples (s, p)`` of the posterior no others apply.
         """
         prediction = self.predict(z, derivatives=False)
         if not prediction.converged:

@@ -65,8 +65,7 @@ class SampledErrors:
     ----------
     base : ObservationNoise
         R of n observations.
-    samples : (n, K)
-        In units of the observation.
+    samples : (n, K) in units of the observation
     source : (K,) or None
         Samples with the same number are not independent; K₋ₖ leaves all of them out, and Student's
         distribution has one degree of freedom for each source. None: all are independent.
@@ -119,8 +118,11 @@ class SampledErrors:
         D = self.base.whiten(self.samples)
         P = Gaussian(np.zeros(len(prior)), prior).covariance
         S = np.zeros_like(P) if curvature is None else curvature
-        U, parts = self._seen()
-        UH, count = U.T @ H, self.samples.shape[1]
+        count = self.samples.shape[1]
+        # Orthonormal directions (n, r) of the whitened samples, and their coordinates (r, K).
+        U, s, Vt = np.linalg.svd(self.base.whiten(self.columns), full_matrices=False)
+        U, parts = np.ascontiguousarray(U[:, s > SEEN]), np.sqrt(count) * s[:, None] * Vt
+        UH, parts = U.T @ H, parts[s > SEEN]
 
         def gain(used: BoolArray) -> tuple[FloatArray, FloatArray]:
             """Gain ``(p, n)`` from some samples, and the factor M on an error of the prior.
@@ -151,11 +153,3 @@ class SampledErrors:
             beside = K @ self.base.whiten(self.beside)
             covariance = covariance + beside @ beside.T
         return SampledPosterior(covariance, part, moved)
-
-    def _seen(self) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal directions ``(n, r)`` of the whitened samples, and coordinates ``(r, K)``."""
-        columns = self.base.whiten(self.columns)
-        U, s, Vt = np.linalg.svd(columns, full_matrices=False)
-        kept = s > SEEN
-        own = np.sqrt(self.samples.shape[1]) * s[kept, None] * Vt[kept]
-        return np.ascontiguousarray(U[:, kept]), own

@@ -87,11 +87,8 @@ class Basis:
     Attributes
     ----------
     points : (k, d)
-    U : (k, m)
-        Orthonormal columns.
-    w : (m,)
-    band : (m,)
-        Of each column.
+    U, w, band : (k, m), (m,), (m,)
+        Orthonormal columns, with the eigenvalue and the band of each.
     across : float
         r.
     length : float

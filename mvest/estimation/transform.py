@@ -1,7 +1,7 @@
 """Coordinates z in which a filter works: the parameters m themselves, or their logarithms.
 
-Each transform is a smooth increasing map of each parameter by itself. ``forward`` is z = T(m),
-``inverse`` is m of z (infinite where it overflows) and ``derivative`` is dm/dz; all are (p,).
+``forward`` is z = T(m), ``inverse`` is m (infinite if it overflows), ``derivative`` is dm/dz; all
+are (p,).
 """
 
 from dataclasses import dataclass
@@ -78,10 +78,7 @@ Transform: TypeAlias = Identity | Log
 
 
 def to_filter(transform: Transform, physical: Gaussian) -> Gaussian:
-    """N(m, P) in filter coordinates to first order: N(T(m), D⁻¹ P D⁻¹) with D = dm/dz at T(m).
-
-    For the logarithm m becomes the median, and a relative deviation becomes an absolute one.
-    """
+    """N(m, P) in filter coordinates to first order: N(T(m), D⁻¹ P D⁻¹) with D = dm/dz at T(m)."""
     z = transform.forward(physical.mean)
     D = transform.derivative(z)
     return Gaussian(z, physical.covariance / np.outer(D, D))

@@ -11,8 +11,8 @@ from mvest.estimation.prediction import read_only
 from mvest.typing import FloatArray
 
 BLOCK_ROWS, BLOCKS_AT_A_TIME = 300, 30
-"""Rows of a block of the whitened Jacobian, and blocks decomposed in one call, which copies them:
-with 20 parameters both fit the second-level cache."""
+"""Rows of a block of the whitened Jacobian, and blocks decomposed in one call: with 20 parameters
+both fit the second-level cache."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,11 +26,10 @@ class Update:
     log_likelihood : float
         log N(e; 0, S) of the innovation, the evidence of the linear model.
     nis : float
-        Normalised innovation squared eᵀ S⁻¹ e; chi-square with n degrees of freedom if the model
-        and its covariances are right.
+        Normalised innovation squared eᵀ S⁻¹ e.
     standardised_innovation : (n,)
-        S^(-1/2) e in the noise's whitened coordinates; independent standard normal numbers if the
-        model and its covariances are right.
+        S^(-1/2) e in the noise's whitened coordinates. If the model and its covariances are right,
+        these are standard normal numbers, and ``nis`` is chi-square with n degrees of freedom.
     """
 
     posterior: Gaussian

@@ -1,9 +1,8 @@
-"""What NIfTI, MetaImage and DICOM files state of their volumes; runs in the child process.
+"""Headers and voxels of NIfTI (nibabel), MetaImage (SimpleITK) and DICOM (pydicom) files.
 
-nibabel reads NIfTI, SimpleITK MetaImage, pydicom DICOM, and pynrrd NRRD (`mvest.exchange._nrrd`).
-Libraries fill in what a header leaves out (a spacing of 1, an origin of 0); here nothing is filled
-in. There must be exactly as many voxels as the header says: SimpleITK reads some truncated files as
-if they were whole.
+Runs in the child process; `mvest.exchange._nrrd` reads NRRD. Libraries fill in missing fields (a
+spacing of 1, an origin of 0); here they are errors. The number of voxels must be that of the
+header: SimpleITK accepts some truncated files.
 """
 
 from __future__ import annotations
@@ -27,22 +26,22 @@ from mvest.typing import FloatArray
 Voxels = NDArray[np.generic]
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "meter": 1e3, "micron": 1e-3}
-"""Units of length by the names that NRRD and NIfTI give them."""
+"""Units of length by their names in NRRD and NIfTI."""
 
 
 def fault(where: str, found: object, expected: str) -> InputError:
-    """What to raise where a file's field is not what it must be; the parent names the file."""
+    """The error of a wrong field; the parent process adds the name of the file."""
     return InputError(f"{where}: {one_line(found, 120)}, expected {expected}")
 
 
 def check(holds: object, where: str, found: object, expected: str) -> None:
-    """Raise the `fault` unless something holds."""
+    """Raise the `fault` unless ``holds``."""
     if not holds:
         raise fault(where, found, expected)
 
 
 class Segment(NamedTuple):
-    """A segment of a ``.seg.nrrd`` file: the value of its voxels, and the frame that holds them."""
+    """A segment of a ``.seg.nrrd`` file: the value of its voxels, and their layer."""
 
     name: str
     tags: str
@@ -52,14 +51,13 @@ class Segment(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stated:
-    """What a file states of its volumes; nothing is checked for plausibility.
+    """The header of a file; plausibility is not checked. Empty or None: not stated.
 
-    ``shape`` is (F, I, J, K), F being the number of frames or layers. Places are LPS in mm: the
-    columns of ``steps`` (3, 3) lead from one voxel to the next along i, j and k; ``origin`` is the
-    centre of voxel (0, 0, 0). ``names`` is what the format calls size, place, origin, values and
-    times. ``times`` (F,) are in ``unit``. ``labels`` is the field that says that the voxels are
-    labels, ``data_file`` the file beside a header that holds them. What is empty or None the file
-    does not state.
+    ``shape`` is (F, I, J, K) with F frames or layers. In LPS and mm, the columns of ``steps``
+    (3, 3) lead to the next voxel along i, j and k, and ``origin`` is the centre of voxel (0, 0, 0).
+    ``names`` are the format's names of size, steps, origin, values and times. ``times`` (F,) are in
+    ``unit``. ``labels`` is the field that makes the voxels labels, ``data_file`` a separate file
+    with the voxels.
     """
 
     shape: tuple[int, ...]
@@ -77,7 +75,7 @@ class Stated:
 
 
 Opened = tuple[Stated, Callable[[], Voxels]]
-"""What a file states, and a function that reads its voxels ``(F, I, J, K)``."""
+"""A header, and a function that reads the voxels ``(F, I, J, K)``."""
 
 
 def required(fields: Mapping[str, Any], name: str, expected: str) -> Any:
@@ -85,8 +83,8 @@ def required(fields: Mapping[str, Any], name: str, expected: str) -> Any:
     return fields[name]
 
 
-def beside(path: Path, where: str, name: str) -> Path:
-    """The data file that a header names; it must lie in the header's own folder."""
+def neighbour_file(path: Path, where: str, name: str) -> Path:
+    """The data file of a header, which must lie in the same folder."""
     other = path.parent / name
     inside = name.isprintable() and other.resolve().parent == path.parent.resolve()
     check(inside and "\\" not in name, where, repr(name), "the name of a file in the same folder")
@@ -96,12 +94,12 @@ def beside(path: Path, where: str, name: str) -> Path:
 
 def _check_length(where: str, found: int, sizes: Any, dtype: np.dtype[Any]) -> None:
     expected = int(np.prod(sizes, dtype=object)) * dtype.itemsize
-    said = f"the {expected} bytes that the header says"
-    check(found == expected, where, f"{found} bytes", said)
+    words = f"the {expected} bytes that the header says"
+    check(found == expected, where, f"{found} bytes", words)
 
 
-# NIfTI 1 and 2: the world is RAS. The unit of length may be missing: of those that the format
-# knows only mm passes the checks of spacing.
+# NIfTI 1 and 2 are RAS. If the unit of length is missing, it is mm: the spacings of no other unit
+# are plausible.
 
 RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
 
@@ -112,7 +110,7 @@ def nifti(path: Path, begin: bytes) -> Opened:
     kind: Any = nibabel.Nifti2Header if begin[4:6] == b"n+" else nibabel.Nifti1Header
     whole = b"ni" not in (begin[344:346], begin[4:6])
     check(whole, "magic", "a header without its image", "one file, .nii or .nii.gz")
-    # Unchecked, as nibabel's checks put right by guessing what is wrong.
+    # nibabel's checks would correct errors by guessing.
     header = kind(begin[: kind.template_dtype.itemsize], check=False)
     sizes, dtype = header.get_data_shape(), header.get_data_dtype()
     affine = np.asarray(header.get_best_affine(), dtype=np.float64)
@@ -154,8 +152,8 @@ def nifti(path: Path, begin: bytes) -> Opened:
     ), load
 
 
-# MetaImage: the world is LPS in mm; the fourth spacing is the time between frames, without a unit.
-# ITK makes up what a header leaves out, and gives voxels of damaged compressed data.
+# MetaImage is LPS in mm; the fourth spacing is the time between frames, without a unit. ITK invents
+# missing fields, and voxels of damaged compressed data.
 
 METAIMAGE_SYNONYMS = {
     **dict.fromkeys(("Position", "Origin"), "Offset"),
@@ -207,7 +205,7 @@ def metaimage(path: Path, head: bytes) -> Opened:
         required(fields, "BinaryDataByteOrderMSB", "the order of bytes")
     name = fields["ElementDataFile"]
     local = name.upper() == "LOCAL"
-    source = path if local else beside(path, "ElementDataFile", name)
+    source = path if local else neighbour_file(path, "ElementDataFile", name)
 
     def load() -> Voxels:
         content = source.read_bytes()[end if local else 0 :]
@@ -228,16 +226,15 @@ def metaimage(path: Path, head: bytes) -> Opened:
     ), load
 
 
-# Philips Cartesian DICOM: 3D echo over time as QLAB exports it, one file for a recording. It is
-# DICOM in form only: unique identifiers and preamble may be missing. Columns, rows and frames are
-# where DICOM has them, the number of slices is (3001,1001); spacings are cm in PhysicalDeltaX,
-# PhysicalDeltaY and (3001,1003); FrameTime is ms; the voxels, columns running fastest, then rows,
-# slices and frames, are the last bytes of PixelData.
+# Philips Cartesian DICOM: 3D echo over time as QLAB exports it, one file per recording. It is DICOM
+# in form only: unique identifiers and preamble may be missing. Columns, rows and frames are in
+# standard fields, the number of slices is (3001,1001); spacings in cm are PhysicalDeltaX,
+# PhysicalDeltaY and (3001,1003); FrameTime is ms. The voxels, columns fastest, then rows, slices
+# and frames, are the last bytes of PixelData.
 #
-# How the volume lies in the patient is not stated. It is placed as SlicerHeart places it
-# (DicomUltrasoundPlugin.py: an image of these spacings without origin or directions, which in 3D
-# Slicer is RAS), so that landmarks from 3D Slicer fit. ITK-SNAP (GuidedNativeImageIO.cxx) has the
-# same origin, and rows and slices the other way.
+# The orientation is not stated; it is that of SlicerHeart (DicomUltrasoundPlugin.py: an image
+# without origin or directions, which in 3D Slicer is RAS), so that landmarks from 3D Slicer fit.
+# ITK-SNAP (GuidedNativeImageIO.cxx) has the same origin, and opposite rows and slices.
 
 PHILIPS = "1.2.840.113543.6.6.1.3.10002"
 PHILIPS_DIRECTION = np.diag([-1.0, -1.0, 1.0])
@@ -262,7 +259,7 @@ def philips(path: Path) -> Opened:
     data: Any = pydicom.dcmread(path, force=True, defer_size=2**16)
 
     def number(name: str) -> float:
-        """A number; its bytes count where the file does not state its type."""
+        """A number, from its bytes if the file does not state its type."""
         key = (0x3001, int(name[6:10], 16)) if name.startswith("(") else name
         check(key in data, name, "not stated", "a number")
         value = data[key].value
@@ -289,7 +286,7 @@ def philips(path: Path) -> Opened:
     def load() -> Voxels:
         element = data["PixelData"]
         content, size = element.value, int(np.prod(shape, dtype=object))
-        # An odd number of bytes is followed by one that makes it even.
+        # DICOM pads an odd number of bytes.
         end = len(content) - (1 if size % 2 and len(content) % 2 == 0 else 0)
         whole = end >= size and not element.is_undefined_length
         check(whole, "PixelData", f"{end} bytes", f"{size} bytes, not compressed")

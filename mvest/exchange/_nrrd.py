@@ -1,10 +1,10 @@
-"""What NRRD files of volumes state, by pynrrd; runs in the child process.
+"""Headers and voxels of NRRD files, by pynrrd; runs in the child process.
 
-The format is https://teem.sourceforge.net/nrrd/format.html. 3D Slicer puts the axis of frames first
-(``kinds: list domain domain domain``) or last, and names their times in ``axis N index values``
-(developer guide, "Sequences"); a multivolume has them in ``MultiVolume.FrameLabels``. Lengths are
-mm unless ``space units`` says otherwise, which is Slicer's convention. ITK writes a volume over
-time as four axes of ``space dimension: 4`` and names no space; ITK's own is LPS.
+Format: https://teem.sourceforge.net/nrrd/format.html. 3D Slicer puts the axis of frames first
+(``kinds: list domain domain domain``) or last, and their times into ``axis N index values``
+(developer guide, "Sequences") or, of a multivolume, ``MultiVolume.FrameLabels``. Lengths are mm
+unless ``space units`` says otherwise, as in Slicer. ITK writes a volume over time as four axes of
+``space dimension: 4`` without a space; it is LPS.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from mvest.exchange._images import (
     Segment,
     Stated,
     Voxels,
-    beside,
     check,
     fault,
+    neighbour_file,
     required,
 )
 from mvest.typing import FloatArray
 
 MODALITY_KEY = "mvest.modality"
-"""Key under which this package writes what the voxels are."""
+"""Key of this package for the modality."""
 TO_LPS = {
     "left-posterior-superior": (1.0, 1.0, 1.0),
     "right-anterior-superior": (-1.0, -1.0, 1.0),
@@ -45,7 +45,7 @@ SHORT = {
 }
 UNSTATED = ("", "???", "none")
 MAX_LINES = 1000
-"""To skip; pynrrd counts them also where there are none left."""
+"""Lines to skip; pynrrd also counts lines behind the end of a file."""
 KINDS_OF_SPACE = ("domain", "space", *UNSTATED)
 KINDS_OF_FRAMES = ("list", "time", "range", "domain", *UNSTATED)
 IMAGE_NODE = "vtkMRMLScalarVolumeNode"
@@ -54,7 +54,7 @@ FRAME_UNIT = "MultiVolume.FrameIdentifyingDICOMTagUnits"
 
 
 def nrrd_file(path: Path, head: bytes) -> Opened:
-    """What a NRRD file states; `head` is its first `MAX_HEADER` bytes."""
+    """The header of a NRRD file; `head` is its first `MAX_HEADER` bytes."""
     end = re.search(rb"\n[ \t\r]*\n", head)
     lines: list[str] = []
     for line in head[: end.start() if end else None].decode(errors="replace").split("\n"):
@@ -79,7 +79,7 @@ def nrrd_file(path: Path, head: bytes) -> Opened:
     shape = (1, *sizes) if axis is None else (sizes.pop(axis), *sizes)
     data_file = fields.pop("datafile", fields.get("data file", ""))
     if data_file:
-        fields["data file"] = str(beside(path, "data file", data_file))
+        fields["data file"] = str(neighbour_file(path, "data file", data_file))
     check(data_file or end, "header", f"no end in {len(head)} bytes", "an empty line")
     lines_to_skip = int(fields.get("line skip", fields.get("lineskip", 0)))
     check(lines_to_skip <= MAX_LINES, "line skip", lines_to_skip, f"at most {MAX_LINES}")
@@ -113,7 +113,7 @@ def nrrd_file(path: Path, head: bytes) -> Opened:
 
 
 def _words(fields: Mapping[str, Any], name: str) -> list[str]:
-    """A field with a word for each axis; empty words where it is missing."""
+    """A field with a word per axis, by default empty words."""
     n = fields["dimension"]
     words = list(fields.get(name, [""] * n))
     check(len(words) == n, name, words, f"a word for each of {n} axes")
@@ -151,7 +151,7 @@ def _place(fields: dict[str, Any]) -> tuple[int | None, FloatArray, FloatArray]:
 
 
 def _times(fields: Mapping[str, Any], axis: int, count: int) -> tuple[str, FloatArray | None, str]:
-    """Where the times of frames stand, or would; the times, if stated; and their unit."""
+    """The field of the times of frames, the times if stated, and their unit."""
     unit = _words(fields, "units")[axis]
     unit = "" if unit in UNSTATED else unit
     for field in (*(f"axis {number} index values" for number in (axis, 0, 3)), FRAME_LABELS):
@@ -176,10 +176,10 @@ def _times(fields: Mapping[str, Any], axis: int, count: int) -> tuple[str, Float
 
 
 def _segments(fields: Mapping[str, Any], layers: int) -> tuple[Segment, ...]:
-    """The segments that 3D Slicer names.
+    """The segments of 3D Slicer.
 
-    Before 4.11 Slicer wrote neither layer nor label: each segment had a layer of its own, and the
-    label 1 (developer guide, "Segmentations").
+    Before 4.11 each segment had a separate layer and the label 1, and neither was written
+    (developer guide, "Segmentations").
     """
     found = (re.match(r"Segment(\d{1,4})_", key, re.ASCII) for key in fields)
     segments = []

@@ -1,10 +1,10 @@
-"""Files of strangers are read in a process of their own, whose memory and time are bounded.
+"""A child process with bounded memory and time that reads the files of users.
 
-Libraries that read files allocate what a header claims, loop, or crash on damaged bytes. Here such
-a file costs the child, and the caller gets an error in one line. One child serves all files that a
-process reads; it is started for the first one, and anew after it died.
+Libraries allocate what a header claims, loop, or crash on damaged bytes. Such a file ends the
+child, and the caller gets an error in one line. One child serves all files of a process; it is
+started for the first file, and again after it died.
 
-Measured: a child costs 0.3 s to start, a call 1 ms, and an array of 100 MB 0.1 s.
+A start takes 0.3 s, a call 1 ms, and an array of 100 MB 0.1 s.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mvest.provenance import THREAD_VARIABLES
 from mvest.reading.text import MAX_LINE, one_line
 
 MEMORY_GB, SECONDS = 3.0, 60.0
-"""Limits of a call: GiB of address space beside the bare process's; s of CPU and of wall time."""
+"""Limits of a call: GiB of address space on top of the bare process; s of CPU and wall time."""
 
 _lock = threading.Lock()
 _child: Program | None = None
@@ -46,15 +46,15 @@ def in_child(
     memory_gb: float = MEMORY_GB,
     seconds: float = SECONDS,
 ) -> Any:
-    """What ``function(path, *arguments)`` returns, computed in the child.
+    """Return ``function(path, *arguments)``, computed in the child.
 
     Parameters
     ----------
     function : callable
-        Of a module of `mvest.exchange`. It returns a tree of dict (keys are str), list, str, int,
-        float, bool, None and NumPy arrays of numbers; tuples become lists.
+        A function of a module of `mvest.exchange` that returns a tree of dict (keys are str), list,
+        str, int, float, bool, None and NumPy arrays of numbers; tuples become lists.
     path : Path
-        The file. It must exist; its name begins every message.
+        The file.
     *arguments : object
         Further arguments that JSON can hold.
     memory_gb, seconds : float
@@ -91,7 +91,8 @@ def in_child(
         timer.daemon = True
         timer.start()
         try:
-            answer = _answer_of(program, call)
+            _write(program.process.stdin, call)
+            answer = _read(program.process.stdout)
         except BaseException as error:
             _child = None
             program.close()
@@ -106,7 +107,7 @@ def in_child(
         finally:
             timer.cancel()
             timer.join()
-        if late.is_set():  # just after the answer
+        if late.is_set():  # the limit passed just after the answer
             _child = None
             program.close()
     if "error" in answer:
@@ -120,13 +121,6 @@ def in_child(
 def _close() -> None:
     if _child is not None and _owner == os.getpid():
         _child.close()
-
-
-def _answer_of(program: Program, call: dict[str, Any]) -> dict[str, Any]:
-    process = program.process
-    _write(process.stdin, call)
-    answer: dict[str, Any] = _read(process.stdout)
-    return answer
 
 
 def _write(stream: Any, tree: Any) -> None:
@@ -173,7 +167,7 @@ def _read(stream: Any) -> Any:
         return exactly(size).view(dtype).reshape(shape)
 
     (size,) = struct.unpack("<q", exactly(8).tobytes())
-    # Objects are completed in the order in which their ends are met, which is that of the bytes.
+    # JSON objects are completed in the order of their ends, which is that of the bytes.
     return json.loads(exactly(size).tobytes(), object_hook=whole)
 
 
@@ -183,12 +177,11 @@ def main() -> None:
     answers: BinaryIO = os.fdopen(os.dup(1), "wb")
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     nothing = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):  # libraries print what they think of a file
+    for stream in (0, 1, 2):  # libraries print messages about a file
         os.dup2(nothing, stream)
     with suppress(EOFError, KeyboardInterrupt):
         while True:
-            call = _read(requests)
-            _write(answers, _answered(call))
+            _write(answers, _answered(_read(requests)))
 
 
 def _answered(call: dict[str, Any]) -> dict[str, Any]:
@@ -214,7 +207,7 @@ def _answered(call: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def _limited(what: int, amount: int) -> Iterator[None]:
-    """Lower the soft limit of a resource for a while."""
+    """Lower the soft limit of a resource."""
     soft, hard = resource.getrlimit(what)
     least = min(n for n in (amount, soft, hard) if n != resource.RLIM_INFINITY)
     resource.setrlimit(what, (least, hard))
@@ -225,7 +218,7 @@ def _limited(what: int, amount: int) -> Iterator[None]:
 
 
 def _size() -> int:
-    """Bytes of address space that this process has; 2 GiB where the system does not say."""
+    """Bytes of address space of this process; 2 GiB if the system does not state it."""
     try:
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[0]
     except OSError:

@@ -1,7 +1,7 @@
 """Points and curves of 3D Slicer: ``.mrk.json`` written and read, the older ``.fcsv`` read.
 
 Rules and defaults are those of the JSON schema ``markups-schema-v1.0.3.json`` of Slicer's module
-Markups and of its reader ``vtkMRMLMarkupsJsonStorageNode``. Positions here are always LPS in mm.
+Markups and of its reader ``vtkMRMLMarkupsJsonStorageNode``. Positions here are LPS in mm.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SCHEMA = (
 TO_LPS = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
 MM_PER = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
 FCSV_AXES = {**TO_LPS, "0": TO_LPS["RAS"], "1": TO_LPS["LPS"]}
-"""As numbers before Slicer 4.11."""
+"""Numbers before Slicer 4.11."""
 FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label"
 MAX_BYTES = 2**24
 
@@ -42,26 +42,19 @@ class PointList:
     Attributes
     ----------
     labels : tuple of str
-        One for each point; a user may leave them empty or repeat them.
+        One per point; may be empty or repeated.
     points : (n, 3) mm
         LPS.
     kind : str
-        ``"Fiducial"`` (points by themselves), ``"Curve"``, ``"ClosedCurve"``, ``"Line"``, ...
+        ``"Fiducial"`` (single points), ``"Curve"``, ``"ClosedCurve"``, ``"Line"``, ...
     unplaced : tuple of str
-        Labels of points that were listed, but never placed.
+        Labels of listed points without a position.
     """
 
     labels: tuple[str, ...]
     points: FloatArray
     kind: str = "Fiducial"
     unplaced: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        if np.shape(self.points) != (len(self.labels), 3) or not np.isfinite(self.points).all():
-            raise InputError(
-                f"points of shape {np.shape(self.points)}, expected {len(self.labels)} x 3 finite "
-                "numbers, as there are labels"
-            )
 
     @classmethod
     def numbered(cls, name: str, points: FloatArray, kind: str = "Fiducial") -> PointList:
@@ -70,19 +63,12 @@ class PointList:
 
 
 def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
-    """Write lists of points and curves under their names.
-
-    Parameters
-    ----------
-    path
-        Ends in ``.mrk.json``.
-    lists
-        By name, at least one.
+    """Write lists of points and curves, by name, to a ``.mrk.json`` file.
 
     Raises
     ------
     InputError
-        Another extension, nothing to write, or a file that cannot be written.
+        Another suffix, no lists, positions that are not finite, or a file that cannot be written.
     """
     target = Path(path)
     if not target.name.endswith(".mrk.json") or not lists:
@@ -98,42 +84,46 @@ def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
         }
         for name, item in lists.items()
     ]
-    content = _File.model_validate({"@schema": SCHEMA, "markups": markups})
+    content = validated(_File, {"@schema": SCHEMA, "markups": markups}, str(target))
     return write_atomically(target, content.model_dump_json(by_alias=True, indent=1) + "\n")
 
 
 def read_markups(path: Path | str) -> dict[str, PointList]:
-    """Read lists of points, lines and curves by their names, in the order of the file.
+    """Read lists of points, lines and curves by name (``.fcsv``, or JSON of Slicer's schema).
 
-    A list without a name is called after the file, as in Slicer. Lists may be empty. Points without
-    a position are left out and named in `PointList.unplaced`.
-
-    Parameters
-    ----------
-    path
-        ``.fcsv``, or JSON of Slicer's schema.
+    A list without a name is named after the file, as in Slicer. Points without a position are in
+    `PointList.unplaced`.
 
     Raises
     ------
     InputError
-        No such file, neither format; an unknown system or unit of length; a placed point whose
-        position is not three numbers.
+        The file is missing or has neither format, an unknown system or unit of length, or a placed
+        point without three numbers.
     """
     source = Path(path)
     if source.suffix.lower() == ".fcsv":
         return {source.stem: _read_fcsv(source)}
+    content = read_bytes(source, MAX_BYTES)
     try:
-        content = validated(_File, json.loads(read_bytes(source, MAX_BYTES)), str(source))
+        data = json.loads(content)
     except (ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{source}: no JSON as Slicer writes it: {one_line(error, 99)}") from error
     result: dict[str, PointList] = {}
-    for item in content.markups:
+    for item in validated(_File, data, str(source)).markups:
         name = item.name or source.name.removesuffix(".json").removesuffix(".mrk")
         while name in result:
             name = f"{name}_{len(result)}"
-        result[name] = item.points()
+        scale = MM_PER[item.unit] * np.array(TO_LPS[item.system])
+        labels: dict[bool, list[str]] = {True: [], False: []}
+        positions = []
+        for point in item.listed:
+            placed = point.position is not None and point.status == "defined"
+            labels[placed].append(one_line(point.label, 80))
+            positions += [point.position] * placed
+        points = np.reshape(np.array(positions, dtype=np.float64), (-1, 3)) * scale
+        result[name] = PointList(
+            tuple(labels[True]), points, one_line(item.type, 80), tuple(labels[False])
+        )
     return result
 
 
@@ -141,7 +131,7 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_NUMBER
 
 
 class _Point(BaseModel):
-    """A control point; of one that was not placed Slicer writes an empty text as position."""
+    """A control point; Slicer writes an empty text as position of one that was not placed."""
 
     id: Any = ""
     label: str = ""
@@ -153,10 +143,6 @@ class _Point(BaseModel):
     locked: Any = False
     visibility: Any = True
     status: Literal["undefined", "preview", "defined"] = Field("defined", alias="positionStatus")
-
-    @property
-    def placed(self) -> bool:
-        return self.position is not None and self.status == "defined"
 
 
 def _code(unit: Any) -> Any:
@@ -174,14 +160,6 @@ class _Markup(BaseModel):
     locked: Any = False
     label_format: Any = Field("%N-%d", alias="labelFormat")
     listed: list[_Point] = Field([], alias="controlPoints")
-
-    def points(self) -> PointList:
-        scale = MM_PER[self.unit] * np.array(TO_LPS[self.system])
-        placed = [p for p in self.listed if p.placed]
-        points = np.array([p.position for p in placed], dtype=np.float64).reshape(-1, 3)
-        labels = tuple(one_line(p.label, 80) for p in placed)
-        unplaced = tuple(one_line(p.label, 80) for p in self.listed if not p.placed)
-        return PointList(labels, points * scale, one_line(self.type, 80), unplaced)
 
 
 class _File(BaseModel):

@@ -1,8 +1,8 @@
-"""Meshes in the files of others, for the child (`mvest.exchange.child`): all end as VTK's objects.
+"""Mesh files of other programs as VTK objects; runs in the child (`mvest.exchange.child`).
 
-VTK reads its own formats, trimesh GLB. STL, OBJ and PLY are read here: VTK takes binary STL files
-that are cut off, and drops the groups of OBJ files and the properties of PLY files; trimesh reads
-no binary PLY files that mix triangles and quadrilaterals.
+VTK reads its own formats, trimesh GLB. STL, OBJ and PLY are read here: VTK accepts truncated STL
+files, and drops the groups of OBJ files and the properties of PLY files; trimesh reads no binary
+PLY files that mix triangles and quadrilaterals.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
 Arrays = Mapping[str, NDArray[np.generic]]
-LINES, STRIPS, POLYGONS = (3, 4), (6,), (5, 7, 9)
-FLAT = (1, 2, *LINES, *STRIPS, *POLYGONS)
-"""VTK's numbers of types of cells; 1 and 2 are vertices by themselves."""
+STRIPS, POLYGONS = (6,), (5, 7, 9)
+FLAT = (1, 2, 3, 4, *STRIPS, *POLYGONS)
+"""VTK's numbers of cell types; 1 and 2 are single vertices, 3 and 4 lines."""
+STL_HEADER = 84
+STL_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def read_cells(path: Path, suffix: str) -> dict[str, Any]:
-    """The fields of `mvest.exchange.surfaces.Surface` for a file of this kind.
+    """The fields of `mvest.exchange.surfaces.Surface` from a file of this kind.
 
     Raises
     ------
     InputError, GeometryError
-        A damaged file, no points, or cells that name points that do not exist.
+        The file is damaged or has no points or cells, or cells name points that do not exist.
     """
     data, groups = _READERS[suffix](path)
     if not data.GetNumberOfPoints():
@@ -45,15 +47,12 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     types, sizes, corners = _cells(data, len(points))
     triangles, rows = _triangles(points, types, sizes, corners)
     at_points, at_cells = _arrays(data.GetPointData()), _arrays(data.GetCellData())
-    for what, count, arrays in (
-        ("points", len(points), at_points),
-        ("cells", len(types), at_cells),
-    ):
+    for what, count, arrays in (("points", points, at_points), ("cells", types, at_cells)):
         for name, values in arrays.items():
-            if len(values) != count:
-                raise InputError(f"data {name!r} has {len(values)} rows, expected {count} {what}")
-    owner = np.repeat(np.arange(len(types)), sizes)
-    onward = (owner[:-1] == owner[1:]) & np.isin(types[owner[:-1]], LINES)
+            if len(values) != len(count):
+                raise InputError(
+                    f"data {name!r} has {len(values)} rows, expected {len(count)} {what}"
+                )
     numbers, counts = np.unique(types[~np.isin(types, FLAT)], return_counts=True)
     name_of = vtk_module("vtkCommonDataModel").vtkCellTypes.GetClassNameFromTypeId
     names = [name_of(number).removeprefix("vtk").lower() for number in numbers.tolist()]
@@ -63,7 +62,6 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     return {
         "vertices": points,
         "triangles": triangles,
-        "segments": np.column_stack([corners[:-1], corners[1:]])[onward],
         "others": dict(zip(names, counts.tolist(), strict=True)),
         "point_data": at_points,
         "cell_data": {name: values[rows] for name, values in at_cells.items()},
@@ -73,16 +71,15 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
 
 
 def _cells(data: Any, count: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Types and sizes ``(c,)`` of all cells, and their corners one after another."""
+    """Types and sizes ``(c,)`` of all cells, and their concatenated corners."""
     if data.IsA("vtkPolyData"):
         parts = [data.GetVerts(), data.GetLines(), data.GetPolys(), data.GetStrips()]
         types = np.repeat([2, 4, 7, 6], [part.GetNumberOfCells() for part in parts])
     else:
-        parts = [data.GetCells()]
-        types = _numpy(data.GetCellTypesArray())
+        parts, types = [data.GetCells()], _numpy(data.GetCellTypesArray())
     corners = np.concatenate([_numpy(part.GetConnectivityArray()) for part in parts])
-    whole = all(part.IsValid() for part in parts)
-    if not whole or (len(corners) and not 0 <= corners.min() <= corners.max() < count):
+    valid = all(part.IsValid() for part in parts)
+    if not valid or (len(corners) and not 0 <= corners.min() <= corners.max() < count):
         raise GeometryError("cells name points that do not exist")
     sizes = np.concatenate([np.diff(_numpy(part.GetOffsetsArray())) for part in parts])
     return types.astype(np.int64), sizes.astype(np.int64), corners.astype(np.int64)
@@ -91,9 +88,9 @@ def _cells(data: Any, count: int) -> tuple[IntArray, IntArray, IntArray]:
 def _triangles(
     points: FloatArray, types: IntArray, sizes: IntArray, corners: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Triangles ``(m, 3)`` of polygons and strips, and the number ``(m,)`` of each one's cell.
+    """Triangles ``(m, 3)`` of polygons and strips, and the number ``(m,)`` of the cell of each.
 
-    VTK cuts polygons, not strips: vtkTriangleFilter 9.7 mistakes the cells of these.
+    VTK triangulates polygons, but not strips: vtkTriangleFilter 9.7 confuses their cells.
     """
     polygon = np.isin(types, POLYGONS) & (sizes > 2)
     flat, rows = corners[np.repeat(polygon, sizes)], np.flatnonzero(polygon)
@@ -103,8 +100,7 @@ def _triangles(
         cutter.Update()
         flat = _numpy(cutter.GetOutput().GetPolys().GetConnectivityArray())
         rows = _numpy(cutter.GetOutput().GetCellData().GetArray("row"))
-    parts, cells = [flat.reshape(-1, 3)], [rows]
-    ends = np.cumsum(sizes)
+    parts, cells, ends = [flat.reshape(-1, 3)], [rows], np.cumsum(sizes)
     for cell in np.flatnonzero(np.isin(types, STRIPS)):
         strip = corners[ends[cell] - sizes[cell] : ends[cell]]
         part = np.column_stack([strip[:-2], strip[1:-1], strip[2:]])
@@ -117,20 +113,13 @@ def _triangles(
 
 
 def vtk_module(name: str) -> Any:
-    """One of VTK's modules; they are imported singly, as all of them take a second."""
+    """One of VTK's modules. Importing all of them takes a second."""
     return importlib.import_module(f"vtkmodules.{name}")
 
 
 def _numpy(array: Any) -> NDArray[Any]:
     result: NDArray[Any] = vtk_module("util.numpy_support").vtk_to_numpy(array)
     return result
-
-
-def _add(into: Any, arrays: Arrays) -> None:
-    for name, values in arrays.items():
-        column = vtk_module("util.numpy_support").numpy_to_vtk(values, deep=1)
-        column.SetName(name)
-        into.AddArray(column)
 
 
 def polydata(
@@ -140,22 +129,25 @@ def polydata(
     point_data: Arrays | None = None,
     cell_data: Arrays | None = None,
 ) -> Any:
-    """VTK's object of polygons: their corners one after another, and how many each has."""
+    """A vtkPolyData of polygons, from their concatenated corners and their sizes."""
     convert, model = vtk_module("util.numpy_support"), vtk_module("vtkCommonDataModel")
     result, cells = model.vtkPolyData(), model.vtkCellArray()
-    places = vtk_module("vtkCommonCore").vtkPoints()
-    places.SetData(convert.numpy_to_vtk(points, deep=1))
+    positions = vtk_module("vtkCommonCore").vtkPoints()
+    positions.SetData(convert.numpy_to_vtk(points, deep=1))
     ends = np.concatenate([[0], np.cumsum(sizes)])
     cells.SetData(*(convert.numpy_to_vtkIdTypeArray(k, deep=1) for k in (ends, corners)))
-    result.SetPoints(places)
+    result.SetPoints(positions)
     result.SetPolys(cells)
-    _add(result.GetPointData(), point_data or {})
-    _add(result.GetCellData(), cell_data or {})
+    for data, arrays in ((result.GetPointData(), point_data), (result.GetCellData(), cell_data)):
+        for name, values in (arrays or {}).items():
+            column = convert.numpy_to_vtk(values, deep=1)
+            column.SetName(name)
+            data.AddArray(column)
     return result
 
 
 def _arrays(data: Any) -> dict[str, Any]:
-    """Arrays of numbers by their names, and text that is one word."""
+    """Numeric arrays by name, and texts of one word."""
     result: dict[str, Any] = {}
     for number in range(data.GetNumberOfArrays()):
         array, name = data.GetAbstractArray(number), data.GetArrayName(number) or ""
@@ -168,26 +160,33 @@ def _arrays(data: Any) -> dict[str, Any]:
 
 
 def _vtk(path: Path, module: str, name: str) -> tuple[Any, list[str]]:
-    """What one of VTK's readers reads; what it says of errors, some as warnings, is raised."""
-    said: list[str] = []
+    """Read by a VTK reader; its error messages are raised, also those that it calls warnings."""
+    errors: list[str] = []
 
-    def heard(_window: object, event: str, text: str) -> None:
-        # Warnings are of damage too; ranges that VTK notes beside an array may be infinite.
+    def listen(_window: object, event: str, text: str) -> None:
+        # "InformationKey": ranges of arrays, which may be infinite.
         if ("Error reading" in text or event == "ErrorEvent") and "InformationKey" not in text:
-            said.append(text)
+            errors.append(text)
 
-    heard.CallDataType = "string0"  # type: ignore[attr-defined]
+    listen.CallDataType = "string0"  # type: ignore[attr-defined]
     window = vtk_module("vtkCommonCore").vtkOutputWindow.GetInstance()
-    tags = [window.AddObserver(event, heard) for event in ("ErrorEvent", "WarningEvent")]
+    tags = [window.AddObserver(event, listen) for event in ("ErrorEvent", "WarningEvent")]
     reader = getattr(vtk_module(module), name)()
     reader.SetFileName(str(path))
     if module == "vtkIOLegacy":
-        _prepare_legacy(reader, path.read_bytes())
+        kinds = ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields")
+        for what in kinds:
+            getattr(reader, f"ReadAll{what}On")()
+        content = path.read_bytes()
+        if b"ASCII" in b"".join(content[:1024].upper().splitlines()[2:3]):
+            # VTK 9.7 invents numbers at the end of a truncated text, but not before a keyword.
+            reader.ReadFromInputStringOn()
+            reader.SetInputString(content.decode("latin-1") + "\nFIELD end 0\n")
     reader.Update()
     for tag in tags:
         window.RemoveObserver(tag)
-    if said:
-        words = re.sub(r"^.*?, line [0-9]+\s", "", said[0], flags=re.S)
+    if errors:
+        words = re.sub(r"^.*?, line [0-9]+\s", "", errors[0], flags=re.S)
         raise InputError(f"damaged: {re.sub(r'^vtk[^:]*0x[0-9a-f]+.: ', '', words)}")
     data = reader.GetOutput()
     if data is None or not (data.IsA("vtkPolyData") or data.IsA("vtkUnstructuredGrid")):
@@ -196,30 +195,13 @@ def _vtk(path: Path, module: str, name: str) -> tuple[Any, list[str]]:
     return data, []
 
 
-def _prepare_legacy(reader: Any, content: bytes) -> None:
-    """Have all arrays read, and numbers that are missing at the end of a text noticed.
-
-    VTK 9.7 makes numbers up where a text ends too early, but not where it meets a word instead. So
-    a field without arrays follows.
-    """
-    for what in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
-        getattr(reader, f"ReadAll{what}On")()
-    if b"ASCII" in b"".join(content[:1024].upper().splitlines()[2:3]):
-        reader.ReadFromInputStringOn()
-        reader.SetInputString(content.decode("latin-1") + "\nFIELD end 0\n")
-
-
-_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_STL_HEADER = 84
-
-
 def _stl(path: Path) -> tuple[Any, list[str]]:
-    """An STL file, its triangles sharing the corners that are equal to the last digit."""
+    """An STL file. VTK accepts truncated ones, and refuses capitals."""
     content = path.read_bytes()
-    count = int.from_bytes(content[80:_STL_HEADER], "little")
-    whole = _STL_HEADER + count * _FACET.itemsize
-    if len(content) == whole or (len(content) > whole and b"\0" in content[:_STL_HEADER]):
-        corners = np.frombuffer(content, _FACET, count, _STL_HEADER)["corners"].astype(np.float64)
+    count = int.from_bytes(content[80:STL_HEADER], "little")
+    whole = STL_HEADER + count * STL_FACET.itemsize
+    if len(content) == whole or (len(content) > whole and b"\0" in content[:STL_HEADER]):
+        corners = np.frombuffer(content, STL_FACET, count, STL_HEADER)["corners"].astype(np.float64)
     elif content.lstrip()[:5].lower() == b"solid":
         words = content.lower().split()
         at = [k for k, word in enumerate(words) if word == b"vertex"]
@@ -228,12 +210,12 @@ def _stl(path: Path) -> tuple[Any, list[str]]:
         corners = np.array([float(word) for k in at for word in words[k + 1 : k + 4]])
     else:
         raise InputError(f"{len(content)} bytes, expected {whole} for {count} triangles")
-    points, numbers = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    return polydata(points, numbers.ravel(), np.full(numbers.size // 3, 3)), []
+    points = corners.reshape(-1, 3)
+    return polydata(points, np.arange(len(points)), np.full(len(points) // 3, 3)), []
 
 
 def _obj(path: Path) -> tuple[Any, list[str]]:
-    """An OBJ file with the names of its groups, or of its objects where there are no groups."""
+    """An OBJ file with the names of its groups, or else of its objects."""
     points: list[tuple[float, float, float]] = []
     corners: list[int] = []
     sizes: list[int] = []
@@ -247,7 +229,7 @@ def _obj(path: Path) -> tuple[Any, list[str]]:
             points.append((float(x), float(y), float(z)))
         elif word == "f":
             face = [int(corner.split("/")[0]) for corner in rest]
-            # A negative number counts from the last vertex so far; none is 0.
+            # Numbers start at 1; negative ones count back from the last vertex so far.
             corners += [k - 1 if k >= 0 else len(points) + k for k in face]
             sizes.append(len(face))
             for kind, name in now.items():
@@ -264,7 +246,7 @@ def _obj(path: Path) -> tuple[Any, list[str]]:
 
 
 _PLY_TYPES = {"char": "i1", "uchar": "u1", "int": "i4", "uint": "u4", "float": "f4"}
-"""That NumPy does not know, or takes for larger ones."""
+"""Types whose names NumPy does not know, or reads as larger ones."""
 _PLY_ORDER: dict[str, Literal["=", "<", ">"]] = {
     "ascii": "=",
     "binary_little_endian": "<",
@@ -280,7 +262,7 @@ def _ply(path: Path) -> tuple[Any, list[str]]:
     if not mark or lines[:1] != [["ply"]] or form not in _PLY_ORDER:
         raise InputError(f"damaged or no PLY file: format {form}, expected {', '.join(_PLY_ORDER)}")
     body = body.partition(b"\n")[2]
-    if form == "ascii":  # every number takes eight bytes then
+    if form == "ascii":  # from here on as if all numbers were binary doubles
         body = np.array(body.split(), dtype="f8").tobytes()
     elements: dict[str, tuple[int, list[tuple[str, list[np.dtype[Any]]]]]] = {}
     for words in lines:
@@ -317,10 +299,10 @@ def _ply(path: Path) -> tuple[Any, list[str]]:
 def _ply_columns(
     body: bytes, at: int, count: int, properties: list[tuple[str, list[np.dtype[Any]]]]
 ) -> tuple[dict[str, NDArray[Any]], int]:
-    """Columns of an element, and where the next one begins.
+    """Columns of an element, and the offset of the next element.
 
-    Of a list there are two: its lengths, and under its name all its numbers one after another.
-    Rows whose lists are as long as those of the first are read at once.
+    A list has two columns: its lengths (``NAME size``) and its concatenated values. Runs of rows
+    with lists of equal length are read together.
     """
     runs: list[NDArray[Any]] = []
     ahead = 16
@@ -350,7 +332,7 @@ def _ply_columns(
 
 
 def _glb(path: Path) -> tuple[Any, list[str]]:
-    """All objects of a scene where its nodes place them, by the names of the nodes or meshes."""
+    """All objects of a scene, placed and named by its nodes (or else named by their meshes)."""
     import trimesh
 
     content = path.read_bytes()

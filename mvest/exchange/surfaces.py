@@ -1,11 +1,10 @@
-"""Surfaces of others with their regions: VTK, STL, OBJ, PLY, GLB; time series for ParaView.
+"""Surfaces with their regions: VTK, STL, OBJ, PLY and GLB are read, VTP and time series written.
 
-A surface comes from one labelled file or from one file per region. Formats without labels (STL, PLY
-without a ``region`` property, OBJ without groups) carry the regions through the files' names:
-``{anterior: a.stl, posterior: p.stl}``. Coincident vertices of such files, of STL and GLB files as
-a whole, and of OBJ files whose objects have vertices of their own, are merged and numbered in the
-order in which the triangles name them, so that two files with the same triangles in the same order
-correspond. A file appears under its name only once it is complete.
+A surface comes from one labelled file or from one file per region. The names of the files carry the
+regions of formats without labels (STL, PLY without a ``region`` property, OBJ without groups):
+``{anterior: a.stl, posterior: p.stl}``. Coincident vertices are merged in surfaces of several
+files, in STL and GLB files, and in OBJ files whose objects have separate vertices. The triangles
+number the merged vertices, so that two files with the same triangles in the same order correspond.
 """
 
 from __future__ import annotations
@@ -31,43 +30,38 @@ from mvest.typing import FloatArray, IntArray
 
 Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
-
 SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply", ".vtk", ".glb")
-"""That are read."""
 REGION_PREFIX = "region."
 MERGE_TOLERANCE = 1e-5
-"""Vertices closer than this share of the bounding box's diagonal are one (0.5 µm on 50 mm)."""
+"""Merge distance over the diagonal of the bounding box (0.5 µm on 50 mm)."""
 MAX_TRIANGLES = 500_000
-"""Of a surface; a case of two such frames is checked in 140 s with 1.2 GB, of 55 000 in 15 s."""
+"""Checking a case of two such frames takes 140 s and 1.2 GB; one of 55 000 triangles 15 s."""
 MAX_NEIGHBOURS = 100
-"""Vertices that are one, on average; where triangles share none there are about six."""
+"""Largest mean number of vertices that are merged into one; unshared triangles have about six."""
+NAME_THEM = "name them anterior and posterior (also in place of AML, PML or Anterior)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A triangulated surface, and what lies beside it in its file.
+    """A triangulated surface with the other contents of its file.
 
     Attributes
     ----------
     vertices
-        ``(n, 3)`` in the unit of the file, all of them in their order; finite.
+        ``(n, 3)`` in the unit of the file; finite.
     triangles
-        ``(m, 3)``, also those of strips and of polygons, which VTK cuts into triangles.
+        ``(m, 3)``, also from strips and polygons.
     point_data, cell_data
-        Named arrays with n or m rows; empty for STL and OBJ.
+        Named arrays with n or m rows.
     groups
-        Name of the group of each triangle, or of its object (OBJ, GLB); empty without any.
+        Name of the group or object of each triangle (OBJ, GLB); empty without any.
     region
-        ``(m,)`` index into the regions of a case; None where nothing labels them.
-    segments
-        ``(k, 2)`` points of the lines of a file, in the direction of each; None where vertices were
-        merged or left out.
+        ``(m,)`` index into the regions of a case; None without labels.
     others
-        How many cells there are of each other type, by its name in VTK ("tetra", "wedge");
-        vertices by themselves are left out.
+        Number of cells of each other type, by its name in VTK ("tetra", "wedge"), without single
+        vertices.
     space
-        "LPS" or "RAS", as 3D Slicer names the axes in a title, a comment or the field data; None
-        where nothing names them.
+        "LPS" or "RAS", as 3D Slicer names the axes in a title, comment or field data; else None.
     """
 
     vertices: FloatArray
@@ -76,22 +70,19 @@ class Surface:
     cell_data: Data = field(default_factory=dict)
     groups: Sequence[str] = ()
     region: IntArray | None = None
-    segments: IntArray | None = None
     others: Mapping[str, int] = field(default_factory=dict)
     space: str | None = None
 
 
 def read_mesh(path: Path | str) -> Surface:
-    """Read the points, triangles and lines of a file, in the child.
+    """Read the points and triangles of a file.
 
     Raises
     ------
     InputError
-        Missing or damaged file, or an extension other than ``.vtu``, ``.vtp``, ``.vtk`` (legacy),
-        ``.stl``, ``.obj``, ``.ply``, ``.glb``.
+        The file is missing or damaged, or its suffix is not one of `SURFACE_SUFFIXES`.
     GeometryError
-        Points that are not finite or beyond `MAX_NUMBER`, or cells that name points that do not
-        exist.
+        Points are not finite or beyond `MAX_NUMBER`, or cells name points that do not exist.
     """
     source = Path(path)
     _check_suffix(source, SURFACE_SUFFIXES)
@@ -105,14 +96,14 @@ def read_mesh(path: Path | str) -> Surface:
 
 
 def read_surface(path: Path | str) -> Surface:
-    """Read a triangulated surface with its data; lines and single vertices beside it do not matter.
+    """Read a triangulated surface with its data; lines and single vertices are ignored.
 
-    Whether it is closed or manifold is not checked here; see `mvest.valve.geometry.surface_checks`.
+    `mvest.valve.geometry.surface_checks` checks whether it is closed or manifold.
 
     Raises
     ------
     InputError, GeometryError
-        As `read_mesh`, no triangles, or cells of other types beside them.
+        As `read_mesh`; there are no triangles, or cells of other types.
     """
     found = read_mesh(path)
     if found.others:
@@ -125,12 +116,11 @@ def read_surface(path: Path | str) -> Surface:
 
 
 def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -> Surface:
-    """Read a surface and which region each of its triangles belongs to.
+    """Read a surface and the region of each triangle.
 
-    Labels are looked for, in this order, in the file names (one file for each region), in the cell
-    data ``region``, in the point data ``region`` (a triangle belongs to the region of at least two
-    of its corners), and in the names of groups or objects (OBJ, GLB). With one region there is
-    nothing to label.
+    The labels are, in this order, the keys of ``files``, the cell data ``region``, the point data
+    ``region`` (a triangle has the label of two of its corners), or the names of groups or objects
+    (OBJ, GLB). A single region needs no labels.
 
     Parameters
     ----------
@@ -142,24 +132,28 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
     Raises
     ------
     InputError, GeometryError
-        A missing, damaged or empty file, unknown or missing labels, a region without triangles.
+        A file is missing or damaged, labels are missing or unknown, a region has no triangles.
     """
     if isinstance(files, Path):
         with refusing(files, "surface"):
             return _labelled(_not_too_large(files), regions, files.suffix.lower())
-    return _labelled(_joined(files, list(regions.values())), regions)
-
-
-def _labelled(whole: Surface, regions: Mapping[int, str], suffix: str = "") -> Surface:
-    """The surface with its labels; ``suffix`` is empty where it comes from several files."""
-    surface = replace(whole, region=_labels(whole, regions))
-    if suffix in ("", ".stl", ".glb") or (suffix == ".obj" and _apart(surface)):
-        surface = merged(surface)
-    if surface.region is not None:
-        empty = [name for k, name in enumerate(regions.values()) if k not in surface.region]
-        if empty:
-            raise GeometryError(f"no triangle belongs to the region {', '.join(empty)}")
-    return surface
+    names = list(regions.values())
+    if unknown := [name for name in files if name not in names]:
+        raise InputError(
+            f"a file for the region {unknown[0]!r}; known are {', '.join(names)}; {NAME_THEM}"
+        )
+    if missing := [name for name in names if name not in files]:
+        raise InputError(f"no file for the region {', '.join(missing)}; expected one for each")
+    parts = [_not_too_large(files[name]) for name in names]
+    shared = set.intersection(*(set(part.point_data) for part in parts))
+    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    whole = Surface(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.triangles + s for part, s in zip(parts, start, strict=False)]),
+        {name: np.concatenate([part.point_data[name] for part in parts]) for name in shared},
+        groups=np.repeat(names, [len(part.triangles) for part in parts]).tolist(),
+    )
+    return _labelled(whole, regions, ".stl")
 
 
 def _not_too_large(file: Path) -> Surface:
@@ -172,61 +166,28 @@ def _not_too_large(file: Path) -> Surface:
     return surface
 
 
-def part_of(surface: Surface, name: str) -> Surface:
-    """The triangles of one group or object, and the vertices that these have.
-
-    Raises
-    ------
-    InputError
-        There is no such one; the message lists some that there are.
-    """
-    own = np.array([group == name for group in surface.groups], dtype=np.bool_)
-    if not own.any():
-        known = one_line(", ".join(sorted(set(surface.groups))[:20]) or "none", 500)
-        raise InputError(f"no part is called {one_line(name, 80)}; there are {known}")
-    used, triangles = np.unique(surface.triangles[own], return_inverse=True)
-    return Surface(
-        surface.vertices[used],
-        triangles.reshape(-1, 3).astype(np.int64),
-        {key: values[used] for key, values in surface.point_data.items()},
-        {key: values[own] for key, values in surface.cell_data.items()},
-        (name,) * int(own.sum()),
-    )
-
-
-def _apart(surface: Surface) -> bool:
-    """Whether there are several regions of which no two share a vertex."""
-    if surface.region is None or len(np.unique(surface.region)) < 2:
-        return False
-    corners = np.column_stack([surface.triangles.ravel(), np.repeat(surface.region, 3)])
-    return len(np.unique(corners, axis=0)) == len(np.unique(surface.triangles))
-
-
-def _joined(files: Mapping[str, Path], names: list[str]) -> Surface:
-    """The surfaces of several files as one; their regions are its groups."""
-    unknown = [name for name in files if name not in names]
-    if unknown:
-        raise InputError(f"a file for the region {unknown[0]!r}; known are {', '.join(names)}")
-    missing = [name for name in names if name not in files]
-    if missing:
-        raise InputError(f"no file for the region {', '.join(missing)}; expected one for each")
-    parts = [_not_too_large(files[name]) for name in names]
-    shared = set.intersection(*(set(part.point_data) for part in parts))
-    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    return Surface(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.triangles + s for part, s in zip(parts, start, strict=False)]),
-        {name: np.concatenate([part.point_data[name] for part in parts]) for name in shared},
-        groups=np.repeat(names, [len(part.triangles) for part in parts]).tolist(),
-    )
+def _labelled(whole: Surface, regions: Mapping[int, str], suffix: str) -> Surface:
+    surface = replace(whole, region=_labels(whole, regions))
+    region = surface.region
+    apart = False
+    if suffix == ".obj" and region is not None and len(np.unique(region)) > 1:
+        corners = np.column_stack([surface.triangles.ravel(), np.repeat(region, 3)])
+        apart = len(np.unique(corners, axis=0)) == len(np.unique(surface.triangles))
+    if apart or suffix in (".stl", ".glb"):
+        surface = merged(surface)
+    if region is not None:
+        empty = [name for k, name in enumerate(regions.values()) if k not in region]
+        if empty:
+            raise GeometryError(f"no triangle belongs to the region {', '.join(empty)}")
+    return surface
 
 
 def merged(surface: Surface) -> Surface:
-    """The surface with coincident vertices made one, numbered as the triangles name them."""
+    """The surface with coincident vertices merged, numbered in the order of the triangles."""
     n = len(surface.vertices)
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     tree, near = cKDTree(surface.vertices), MERGE_TOLERANCE * diagonal
-    # Counted before they are listed, as a few points far away make all others near each other.
+    # Far outliers make all other vertices coincident. Listing the pairs would need much memory.
     if tree.count_neighbors(tree, near) > MAX_NEIGHBOURS * n:
         raise GeometryError(
             f"vertices lie within {near:.2g} of each other, {MERGE_TOLERANCE:g} of the surface's "
@@ -244,7 +205,6 @@ def merged(surface: Surface) -> Surface:
         vertices=surface.vertices[keep],
         triangles=rank[inverse].reshape(-1, 3),
         point_data={name: values[keep] for name, values in surface.point_data.items()},
-        segments=None,
     )
 
 
@@ -262,7 +222,7 @@ def _labels(surface: Surface, regions: Mapping[int, str]) -> IntArray | None:
                 f"triangles {torn[:5].tolist()} have corners in three regions; give the region as "
                 "cell data"
             )
-        # The middle one of three sorted labels is the one that occurs at least twice.
+        # The middle one of three sorted labels occurs at least twice.
         return ordered[:, 1]
     groups, names = np.array(surface.groups), {name: name for name in regions.values()}
     if len(set(groups)) > 1 or (len(groups) and groups[0] in names):
@@ -273,19 +233,19 @@ def _labels(surface: Surface, regions: Mapping[int, str]) -> IntArray | None:
 def _indices(
     labels: NDArray[np.generic], known: Mapping[Any, str], what: str, where: str
 ) -> IntArray:
-    """Labels as indices into those that are known, by which words an error lists them."""
+    """Labels as indices into the known ones, whose values describe them in an error."""
     if labels.ndim != 1:
         raise InputError(f"{where} has {labels.shape[1]} components, expected one label")
     found, inverse = np.unique(labels, return_inverse=True)
-    place = {label: k for k, label in enumerate(known)}
-    result = np.array([place.get(label, -1) for label in found.tolist()])[inverse]
-    bad = np.flatnonzero(result < 0)
-    if len(bad):
+    index = {label: k for k, label in enumerate(known)}
+    result = np.array([index.get(label, -1) for label in found.tolist()])[inverse]
+    if len(bad := np.flatnonzero(result < 0)):
         odd = [k if isinstance(k, str) else f"{k:g}" for k in found[np.unique(inverse[bad])]]
+        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
         raise InputError(
             f"{where}: unknown label {one_line(', '.join(odd[:5]), 80)} at {what} "
-            f"{bad[:5].tolist()}{f' and {len(bad) - 5} more' if len(bad) > 5 else ''}; known are "
-            f"{', '.join(known.values())}"
+            f"{bad[:5].tolist()}{more}; known are {', '.join(known.values())}"
+            + (f"; {NAME_THEM}" if where == "groups" else "")
         )
     return result
 
@@ -305,13 +265,13 @@ def write_surface(
 ) -> Path:
     """Write a triangulated surface as a ``.vtp`` file.
 
-    ``space`` ("LPS") names the axes where 3D Slicer finds it.
+    ``space`` ("LPS") names the axes for 3D Slicer.
 
     Raises
     ------
     InputError, GeometryError
-        Another extension, no triangles, points that are not finite, data of another number of rows,
-        or a file that cannot be written.
+        Another suffix, points that are not finite, data that do not fit, or a file that cannot be
+        written.
     """
     target = Path(path)
     _check_suffix(target, (".vtp",))
@@ -319,10 +279,6 @@ def write_surface(
     faces = np.ascontiguousarray(triangles, dtype=np.int64)
     if not np.isfinite(points).all():
         raise GeometryError(f"{target}: points that are not finite numbers")
-    if points.shape[1:] != (3,) or faces.shape[1:] != (3,) or not len(faces):
-        raise InputError(f"{target}: {points.shape} and {faces.shape}, expected (n, 3) and (m, 3)")
-    if faces.min() < 0 or faces.max() >= len(points):
-        raise InputError(f"{target}: triangles name points outside 0 to {len(points) - 1}")
     data = [
         {name: np.ascontiguousarray(v, np.int8 if v.dtype == bool else None) for name, v in given}
         for given in ((point_data or {}).items(), (cell_data or {}).items())
@@ -335,25 +291,25 @@ def write_surface(
                     f"expected {rows} rows of numbers"
                 )
     surface = polydata(points, faces.ravel(), np.full(len(faces), 3), *data)
-    return write_atomically(target, lambda file: _write_vtp(file, surface, space))
-
-
-def _write_vtp(path: Path, surface: Any, space: str) -> None:
     if space:
         words = vtk_module("vtkCommonCore").vtkStringArray()
         words.SetName("SPACE")
         words.InsertNextValue(space)
         surface.GetFieldData().AddArray(words)
-    writer = vtk_module("vtkIOXML").vtkXMLPolyDataWriter()
-    writer.SetFileName(str(path))
-    writer.SetInputData(surface)
-    writer.SetDataModeToBinary()
-    if not writer.Write():
-        raise OSError(f"VTK's error {writer.GetErrorCode()}")
+
+    def write(file: Path) -> None:
+        writer = vtk_module("vtkIOXML").vtkXMLPolyDataWriter()
+        writer.SetFileName(str(file))
+        writer.SetInputData(surface)
+        writer.SetDataModeToBinary()
+        if not writer.Write():
+            raise OSError(f"VTK's error {writer.GetErrorCode()}")
+
+    return write_atomically(target, write)
 
 
 def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
-    """Cell data that carry the labels and, as one indicator per region, their names in order."""
+    """Cell data with the labels, and an indicator per region that carries its name."""
     result: dict[str, NDArray[np.generic]] = {"region": region}
     for number, name in enumerate(names):
         result[REGION_PREFIX + name] = (region == number).astype(np.int8)
@@ -363,15 +319,14 @@ def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray
 def write_surface_series(
     path: Path | str, times: Sequence[float], states: Sequence[Surface]
 ) -> Path:
-    """Write surfaces over time for ParaView and 3D Slicer, each with triangles and data of its own.
+    """Write surfaces over time (LPS) for ParaView and 3D Slicer.
 
-    The states ``NAME_0000.vtp``, ``NAME_0001.vtp``, ... lie beside the index ``NAME.pvd``, which is
-    written last. They name their axes (LPS) as Slicer does.
+    The states ``NAME_0000.vtp``, ``NAME_0001.vtp``, ... lie next to their index ``NAME.pvd``.
 
     Raises
     ------
     InputError
-        As many times as states, at least one, increasing; data of another number of rows.
+        Times do not increase or do not fit the states; as `write_surface`.
     """
     index = Path(path)
     _check_suffix(index, (".pvd",))

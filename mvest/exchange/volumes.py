@@ -1,24 +1,25 @@
-"""Volumes over time and label maps, from every format that is read.
+"""Volumes over time and label maps: reading every known format, writing ``.seq.nrrd``.
 
-A file's content counts, not its name. Nothing is guessed: what the file does not state must be
-given, and what it states must not be contradicted. All of a file is read in the child process:
-first what it states, then its voxels within a limit of memory that follows from their number.
+The content of a file decides its format, not its name. Nothing is guessed: the caller must give
+what the file does not state, and must not contradict what it states. The child process reads the
+file: first its header, then its voxels within a memory limit that follows from their number.
 
-The bounds leave room for any 4D image of a heart. They catch what is no such image: pixels read in
-the wrong order, centimetres taken for millimetres, a mask, a localiser. A label map may be smaller
-and emptier than an image.
+The bounds admit any 4D image of a heart and catch what is none: pixels in the wrong order,
+centimetres taken for millimetres, a mask, a localiser. A label map may be smaller and emptier than
+an image.
 """
 
 from __future__ import annotations
 
 import gzip
 import hashlib
+import io
 import re
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import nrrd
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,54 +37,55 @@ from mvest.exchange._images import (
 )
 from mvest.exchange._nrrd import MODALITY_KEY, nrrd_file
 from mvest.exchange.child import in_child
+from mvest.files import write_atomically
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
 
 MAX_BYTES = 4 * 2**30
-"""Of all frames, decoded: twenty of CT, 512 x 512 x 300 voxels of two bytes, have 2.9 GiB. Reading
-takes up to three times as much memory for a while."""
-MAX_UNASKED, MAX_RATIO = 2**28, 1000
-"""Bytes that any compressed file may hold, and how many times its own size beyond that: images of
-the heart have 1.5 to 20 times, label maps some hundred."""
+"""Largest decoded size of all frames: twenty frames of CT, 512 x 512 x 300 voxels of two bytes,
+have 2.9 GiB."""
+MAX_UNCHECKED, MAX_RATIO = 2**28, 1000
+"""Decoded bytes that any file may have, and largest compression ratio beyond that: images of the
+heart have ratios of 1.5 to 20, label maps of some hundred."""
 COPIES = 3
-"""Of the voxels, that a reader may hold for a while beside 1 GiB."""
+"""Memory limit of reading, in copies of the voxels, on top of 1 GiB."""
 BYTES_PER_SECOND = 2**25
-"""Decoded by a slow machine; reading may take that long and a minute."""
+"""Decoding rate of a slow machine; reading may take this time and a minute."""
 
 READABLE = "NRRD, MetaImage, NIfTI or Philips Cartesian DICOM"
 MAX_HEADER = 2**20
-"""Bytes within which a header ends."""
+"""Largest size of a header (bytes)."""
 
 SECONDS_PER_UNIT = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),
     **dict.fromkeys(("us", "usec", "microsecond", "microseconds"), 1e-6),
 }
-"""Units of time by the names that files give them."""
+"""Names of units of time in files."""
 
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.002, 1.0
 """Bounds of the interval between two frames of a beating heart, the upper one excluded.
 
-No scanner takes 500 volumes per second; a second between frames leaves one to a beat, and is what
-many programs write where they know nothing. So milliseconds taken for seconds are seen, and seconds
-taken for milliseconds.
+No scanner takes 500 volumes per second. One second is the default of many programs, and would leave
+one frame per beat. The bounds tell milliseconds from seconds.
 """
 SPACING_MM = (0.05, 5.0)
-"""Between neighbouring voxels; 3D echo has 0.3 to 1.5, CT 0.2 to 1, MR up to 5."""
+"""Voxel spacing; 3D echo has 0.3 to 1.5, CT 0.2 to 1, MR up to 5."""
 EXTENT_MM, LABELS_MM = (20.0, 500.0), (2.0, 500.0)
-"""Of an image along each axis: from an annulus to a whole chest; and of a label map, whose box may
+"""Extent along each axis: of an image, from an annulus to a whole chest; of a label map, which may
 be cropped to the leaflets of a child."""
 MIN_VOXELS, MIN_LABELS = 16, 2
-"""Voxels along each axis of an image, and of a label map."""
+"""Least number of voxels along each axis of an image, and of a label map."""
 MAX_OFFSET_MM = 1e4
-"""Of the origin from the world's zero."""
+"""Largest coordinate of the origin."""
 ORTHOGONAL = 1e-3
-"""Largest cosine between axes, which files give with three digits or more."""
+"""Largest cosine between axes; files state them with three digits or more."""
+WRITABLE = ("uint8", "int16", "float32")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelMap:
-    """Labelled voxels of one region. World coordinates are LPS, in mm.
+    """Labelled voxels. World coordinates are LPS, in mm.
 
     Attributes
     ----------
@@ -96,12 +98,8 @@ class LabelMap:
         Its columns are the unit vectors of i, j and k; orthonormal, perhaps left-handed.
     origin : (3,) mm
         Centre of voxel (0, 0, 0).
-    times : (F,) s or None
-        None where the file states none that a beating heart could have.
     segments : tuple of Segment
-        Those that a ``.seg.nrrd`` names; empty for other files.
-    sha256 : str
-        Of the file, with its data file if that is another one.
+        Segments that a ``.seg.nrrd`` names; empty for other files.
     """
 
     frames: NDArray[np.integer]
@@ -109,9 +107,7 @@ class LabelMap:
     spacing: FloatArray
     direction: FloatArray
     origin: FloatArray
-    times: FloatArray | None
     segments: tuple[Segment, ...]
-    sha256: str
 
 
 def read_volume(
@@ -121,9 +117,7 @@ def read_volume(
     frame_interval_s: float | None = None,
     time_unit: str | None = None,
 ) -> VolumeSequence:
-    """Read a volume over time. Directions stay as the file has them, left-handed ones included.
-
-    A file may hold a single frame.
+    """Read a volume over time, or a single frame. Left-handed directions stay left-handed.
 
     Parameters
     ----------
@@ -131,7 +125,7 @@ def read_volume(
         NRRD (``.nrrd``, ``.seq.nrrd``, ``.nhdr``), MetaImage (``.mha``, ``.mhd``), NIfTI (``.nii``,
         ``.nii.gz``) or Philips Cartesian DICOM.
     modality
-        What the voxels are, for files that do not say: all but DICOM and those of this package.
+        Required unless the file states it: DICOM, and files of this package.
     frame_interval_s
         Seconds between frames, for files that state no times in a unit of time.
     time_unit
@@ -140,9 +134,8 @@ def read_volume(
     Raises
     ------
     InputError
-        In one line the file, the field, what was found and what was expected: a file that is
-        damaged or of another kind, something that it does not state or the caller contradicts, or
-        what no image of a heart has.
+        The file is damaged or of another kind, does not state something, contradicts an argument,
+        or is no plausible image of a heart.
     """
     source = Path(path)
     if source.is_dir():
@@ -158,20 +151,74 @@ def read_volume(
 def read_labels(path: Path | str) -> LabelMap:
     """Read a label map or segmentation: NRRD, MetaImage or NIfTI of three or four axes.
 
-    Frames and layers may be empty, and need no times.
+    Raises
+    ------
+    InputError
+        As `read_volume`; an image, no labels, or values that are not whole numbers.
+    """
+    found = _read(Path(path), True)
+    del found["sha256"]
+    return LabelMap(**found | {"segments": tuple(Segment(*one) for one in found["segments"])})
+
+
+def sequence_path(path: Path | str) -> Path:
+    """The path, which must end in ``.seq.nrrd``.
 
     Raises
     ------
     InputError
-        As `read_volume`; an image, no label at all, or values that are no whole numbers.
+        Another name.
     """
-    found = _read(Path(path), True)
-    segments = tuple(Segment(*segment) for segment in found["segments"])
-    return LabelMap(**found | {"segments": segments})
+    target = Path(path)
+    if not target.name.endswith(".seq.nrrd") or target.name == ".seq.nrrd":
+        raise InputError(f"{target}: name {target.name!r}, expected one that ends in .seq.nrrd")
+    return target
+
+
+def write_sequence_nrrd(path: Path | str, sequence: VolumeSequence) -> Path:
+    """Write a volume over time with its times and modality; the same content gives the same bytes.
+
+    The axis of frames comes first, which all versions of Slicer read.
+
+    Parameters
+    ----------
+    path
+        Ends in ``.seq.nrrd``.
+    sequence
+        Of uint8, int16 or float32.
+
+    Raises
+    ------
+    InputError
+        Another name or type, or a file that cannot be written.
+    """
+    target = sequence_path(path)
+    if (found := sequence.frames.dtype.name) not in WRITABLE:
+        raise InputError(f"{target}: frames of type {found}, expected {', '.join(WRITABLE)}")
+    steps = (sequence.direction * sequence.spacing).T
+    header = {
+        "space": "left-posterior-superior",
+        "space directions": np.vstack([np.full((1, 3), np.nan), steps]),
+        "space origin": np.asarray(sequence.origin, dtype=np.float64),
+        "kinds": ["list", "domain", "domain", "domain"],
+        "labels": ["time", "", "", ""],
+        "units": ["s", "", "", ""],
+        "encoding": "gzip",
+        "DataNodeClassName": "vtkMRMLScalarVolumeNode",
+        "axis 0 index type": "numeric",
+        "axis 0 index values": " ".join(repr(float(time)) for time in sequence.times),
+        MODALITY_KEY: sequence.modality.value,
+    }
+    content = io.BytesIO()
+    nrrd.write(content, sequence.frames, header, compression_level=1)
+    head, end, voxels = content.getvalue().partition(b"\n\n")
+    # pynrrd writes the time into comments.
+    lines = [line for line in head.split(b"\n") if not line.startswith(b"#")]
+    return write_atomically(target, b"\n".join(lines) + end + voxels)
 
 
 def files_of_volume(path: Path) -> dict[str, Path]:
-    """Name -> file of all that reading a volume opens: itself, and its data file if it has one."""
+    """Files that reading a volume opens, by name: itself, and its data file if it has one."""
     try:
         files = _files(path, in_child(data_file_of, path))
     except InputError:
@@ -184,11 +231,11 @@ def _files(path: Path, data_file: str) -> list[Path]:
 
 
 def _read(path: Path, labels: bool, *options: Any) -> dict[str, Any]:
-    """What a file states, its voxels, and the SHA-256 of all of its bytes."""
+    """The header of a file, its voxels, and the SHA-256 of all its bytes."""
     found: dict[str, Any] = in_child(describe, path, labels, *options)
     size, files = found.pop("bytes"), _files(path, found.pop("data_file"))
     stored = sum(file.stat().st_size for file in files)
-    if size > max(MAX_UNASKED, MAX_RATIO * stored):
+    if size > max(MAX_UNCHECKED, MAX_RATIO * stored):
         raise InputError(
             f"{path}: data: {size} bytes compressed to {stored}, expected at most {MAX_RATIO} "
             "times as many; save it without compression"
@@ -211,15 +258,9 @@ def describe(
     frame_interval_s: float | None = None,
     time_unit: str | None = None,
 ) -> dict[str, Any]:
-    """What a file and its user state of an image or of labels, once all of it is plausible.
+    """The checked header of an image or label map: fields of the result without the voxels.
 
-    That is its spacing, direction, origin and times, the bytes of its voxels and the name of its
-    data file; the modality of an image; segments of labels, and whether their frames are layers.
-
-    Raises
-    ------
-    InputError
-        As `read_volume` and `read_labels`.
+    ``bytes`` (of the decoded voxels) and ``data_file`` are added.
     """
     stated, _ = _opened(path)
     result = _common(stated, labels)
@@ -228,23 +269,11 @@ def describe(
         result["times"] = _times(stated, frame_interval_s, time_unit)
         return result | {"modality": _modality(stated.modality, modality)}
     check(not stated.modality, "modality", stated.modality, "a label map, no image")
-    result |= {"times": None, "segments": stated.segments, "is_layers": stated.is_layers}
-    # Many programs write times that no heart has where they know none.
-    with suppress(InputError):
-        if stated.times is not None and not stated.is_layers:
-            result["times"] = _times(stated, None, None)
-    return result
+    return result | {"segments": stated.segments, "is_layers": stated.is_layers}
 
 
 def read_voxels(path: Path, labels: bool) -> Voxels:
-    """Voxels ``(F, I, J, K)``: integers of labels; uint8, int16 or float32 of an image.
-
-    Raises
-    ------
-    InputError
-        Damaged data; of an image a frame without contrast, or values that are no numbers; no label
-        at all, or labels that are no whole numbers.
-    """
+    """Checked voxels ``(F, I, J, K)``: integer labels, or uint8, int16 or float32 of an image."""
     stated, load = _opened(path)
     field, frames = stated.names[3], np.ascontiguousarray(load())
     if labels:
@@ -270,19 +299,12 @@ def read_voxels(path: Path, labels: bool) -> Voxels:
 
 
 def data_file_of(path: Path) -> str:
-    """Name of the file beside a header that holds its voxels; empty if there is none."""
+    """Name of a separate file with the voxels, or an empty text."""
     return _opened(path)[0].data_file
 
 
 def _opened(path: Path) -> Opened:
-    """What a file states and how its voxels are read; its content counts, not its name.
-
-    Raises
-    ------
-    InputError
-        A format that is not read, or a field that is missing, damaged or not supported. The
-        function that reads voxels raises it if there are fewer or more than the header says.
-    """
+    """The header of a file, and a function that reads its voxels."""
     with path.open("rb") as file:
         head = begin = file.read(MAX_HEADER)
     if head[:2] == b"\x1f\x8b":
@@ -300,10 +322,7 @@ def _opened(path: Path) -> Opened:
 
 
 def _common(stated: Stated, labels: bool) -> dict[str, Any]:
-    """Place of a volume that is plausible, the bytes of its voxels, and its data file's name.
-
-    A left-handed system stays one.
-    """
+    """Checked geometry of a volume, the bytes of its voxels, and the name of its data file."""
     min_voxels, extent_mm = (MIN_LABELS, LABELS_MM) if labels else (MIN_VOXELS, EXTENT_MM)
     (size, place, origin, values, _), shape = stated.names, stated.shape
     counted = f"{' x '.join(map(str, shape))} frames and voxels"
@@ -328,7 +347,7 @@ def _common(stated: Stated, labels: bool) -> dict[str, Any]:
     check(fits, place, f"a volume of {_words(extent)} mm", expected.format(*extent_mm))
     near = (np.abs(stated.origin) <= MAX_OFFSET_MM).all()
     check(near, origin, _words(stated.origin), f"coordinates in mm within {MAX_OFFSET_MM:g}")
-    # The closest orthonormal axes take away what rounding in the file left; none is turned round.
+    # The closest orthonormal axes remove rounding errors of the file and keep the handedness.
     left, _, right = np.linalg.svd(axes)
     return {
         "spacing": spacing,
@@ -350,7 +369,7 @@ def _times(stated: Stated, frame_interval_s: float | None, time_unit: str | None
     if frame_interval_s is not None:
         known = given is not None and unit is not None
         check(not known, "frame_interval_s", frame_interval_s, f"none: {field} states the times")
-        check(time_unit is None, "frame_interval_s", "beside time_unit", "one of the two")
+        check(time_unit is None, "frame_interval_s", "given with time_unit", "one of the two")
         positive = np.isfinite(frame_interval_s) and frame_interval_s > 0
         check(positive, "frame_interval_s", frame_interval_s, "a positive number")
         given, unit = np.arange(count, dtype=np.float64), frame_interval_s

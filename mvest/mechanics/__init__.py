@@ -1,4 +1,4 @@
-"""What the physics is: laws, elements, loads, contact, time integration, sensitivities.
+"""The physics: laws, elements, loads, contact, time integration, sensitivities.
 
 Axes. One convention holds for every array here: the element (or face, point, cable) axis first,
 then the quadrature point, then the components; nodal arrays have the node axis first and xyz last.
@@ -6,19 +6,18 @@ Element kernels take and return element arrays; only :mod:`~mvest.mechanics.asse
 unknowns. Symmetric tensors are six-vectors 11, 22, 33, 23, 13, 12 in the fibre frame (strains with
 engineering shear). Lengths are mm, times s, masses tonne, forces N, stresses MPa.
 
-What is here, in the order data flows:
+Modules, in the order of the data flow:
 
-* ``parameters``: what can be differentiated by; ``law``: transversely isotropic moduli, the law in
-  Biot strain, an exponential one, one between both, and the law of leaflets, whose tissue differs
-  from place to place and may be prestretched;
-  ``solid``: strains, forces and tangents of all elements of a mesh;
-* ``forces``: what acts on the solid (pressure, chordae, annular hinge, ties, contact);
-* ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;
+* ``parameters``: parameters of the derivatives; ``law``: transversely isotropic moduli, the law in
+  Biot strain, an exponential one, one between both, and the law of leaflets with varying and
+  prestretched tissue; ``solid``: strains, forces and tangents of all elements of a mesh;
+* ``forces``: pressure, chordae, annular hinge, ties, contact;
+* ``assembly``, ``system``: residual, tangent and partial derivatives of everything together;
 * ``solver``: sparse direct solvers; ``steps``, ``integrate``: settings and results, time steps,
   Newton's method, sensitivities;
-* ``body``: all of it without a valve, and boxes of cells.
+* ``body``: bodies without a valve, and boxes of cells.
 
-A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at its rim):
+A body from plain arrays (a sheet of tetrahedra, six per cell, clamped at its rim):
 
 >>> import itertools, numpy as np
 >>> from mvest.mechanics import TransverselyIsotropic, outer_faces, simulate_body

@@ -1,13 +1,12 @@
-"""Where element arrays become global: the sparsity pattern and the scatter into it.
+"""The global sparsity pattern, and the assembly of element arrays into it.
 
-Everything that adds stiffness does so as dense node-pair blocks: a group couples a list of row
-nodes with a list of column nodes, and its tangent is ``(rows, columns, 3, 3)``. The pattern is kept
-at node level (block rows of 3x3), so positions are looked up once and the scatter is a plain
-indexed addition.
+All stiffness is added as dense blocks of node pairs: a group couples row nodes with column nodes,
+and its tangent is ``(rows, columns, 3, 3)``. The pattern is one of nodes (3x3 blocks), so that
+positions are looked up once and assembly is an indexed addition.
 
-All that has an energy (tissue, chordae, contact) has a symmetric tangent, of which the blocks of
-the upper triangle are kept. What follower pressure adds to the symmetric part is skew and lies
-along the rim of the loaded surface: some more blocks.
+Tissue, chordae and contact have an energy and hence a symmetric tangent, of which the upper
+triangle is stored. Follower pressure adds a skew part along the rim of the loaded surface, which
+has blocks of its own.
 """
 
 from __future__ import annotations
@@ -29,17 +28,16 @@ Positions = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class SparsityPattern:
-    """Where the blocks of a matrix lie: those of the upper triangle by rows, then the skew ones.
+    """Positions of the blocks of a matrix: the upper triangle by rows, then the skew part.
 
     Attributes
     ----------
     pointer : ndarray
-        ``(n + 1,)`` where the rows of the upper triangle start, each with its diagonal block.
+        ``(n + 1,)`` start of each row of the upper triangle, which begins with its diagonal block.
     columns : ndarray
         ``(u,)`` sorted in each row.
     skew : ndarray
-        ``(s, 2)`` rows and columns of the blocks of the skew part, no row behind its column; in
-        this order.
+        ``(s, 2)`` sorted rows and columns of the skew blocks, with row <= column.
     """
 
     pointer: Positions
@@ -48,13 +46,9 @@ class SparsityPattern:
 
     @classmethod
     def of(cls, coupled: sparse.csr_matrix, skew: IntArray) -> SparsityPattern:
-        """Pattern of the entries stored in ``coupled (n, n)``, symmetric and with its diagonal.
+        """Pattern of a symmetric matrix ``coupled (n, n)`` with its full diagonal.
 
-        Parameters
-        ----------
-        coupled : sparse matrix
-        skew : ndarray
-            ``(s, 2)`` pairs of nodes that may be coupled unsymmetrically, in any order.
+        ``skew (s, 2)`` are pairs of nodes with unsymmetric coupling, in any order.
         """
         upper = sparse.triu(coupled, format="csr")
         upper.sort_indices()
@@ -64,16 +58,9 @@ class SparsityPattern:
     def with_coupling(
         self, elements: IntArray, pairs: IntArray, around: tuple[IntArray, IntArray]
     ) -> SparsityPattern:
-        """The pattern where all nodes of some pairs of elements are coupled as well.
+        """The pattern with all nodes of the element ``pairs (g, 2)`` coupled in addition.
 
-        Parameters
-        ----------
-        elements : ndarray
-            ``(e, k)``.
-        pairs : ndarray
-            ``(g, 2)`` elements that are coupled.
-        around : tuple of ndarray
-            The elements of each node, see `elements_of_nodes`.
+        ``elements (e, k)`` have the nodes, and ``around`` is from `elements_of_nodes`.
         """
         if len(pairs) == 0:
             return self
@@ -102,17 +89,17 @@ class SparsityPattern:
         return np.concatenate([self.columns, self.skew[:, 1]])
 
     def within(self, nodes: IntArray) -> Positions:
-        """Positions ``(g, k, k)`` of the blocks that couple the nodes ``(g, k)`` of each group.
+        """Positions ``(g, k, k)`` of the blocks between the nodes ``(g, k)`` of each group.
 
-        -1 for those of the lower triangle. All must be in the pattern.
+        -1 in the lower triangle. All blocks must be in the pattern.
         """
         return _within(self.pointer, self.columns, nodes)
 
     def between(self, first: IntArray, second: IntArray) -> Positions:
         """Positions ``(g, k, k)`` of the blocks that couple nodes ``(g, k)`` with others.
 
-        Those of the lower triangle are where their mirror images are. A node coupled with itself
-        has position p as ``-1 - p``: there the block and its mirror image are the same.
+        A block of the lower triangle has the position of its mirror image. The diagonal block of a
+        node, which is its own mirror image, has its position p as ``-1 - p``.
         """
         return _between(self.pointer, self.columns, first, second)
 
@@ -130,7 +117,7 @@ class SparsityPattern:
         return np.zeros((len(self.columns) + len(self.skew), 3, 3))
 
     def matrix(self, blocks: FloatArray) -> BlockMatrix:
-        """The matrix ``(3n, 3n)`` with the given block data, which it refers to."""
+        """The matrix ``(3n, 3n)`` that refers to the given block data."""
         return BlockMatrix(self, blocks)
 
 
@@ -142,8 +129,8 @@ class BlockMatrix:
     ----------
     pattern : SparsityPattern
     blocks : ndarray
-        ``(u + s, 3, 3)``; a block of the skew part is that of its row and column, and its negative
-        transpose is that of column and row.
+        ``(u + s, 3, 3)``; each stands for its mirror image as well: its transpose, or its negative
+        transpose in the skew part.
     """
 
     pattern: SparsityPattern
@@ -162,7 +149,7 @@ class BlockMatrix:
         return _product(pattern.pointer, pattern.columns, pattern.skew, self.blocks, x)
 
     def tobsr(self) -> sparse.bsr_matrix:
-        """The same with all its blocks."""
+        """The same as a SciPy matrix with all blocks."""
         rows, columns = self.pattern.rows, self.pattern.all_columns
         off = rows != columns
         sign = np.where(np.arange(len(rows)) < len(self.pattern.columns), 1.0, -1.0)[off]
@@ -177,15 +164,7 @@ class BlockMatrix:
 
 
 def adjacency(n: int, groups: Sequence[IntArray]) -> sparse.csr_matrix:
-    """Matrix ``(n, n)`` with an entry for each pair of nodes that are in a group together.
-
-    Parameters
-    ----------
-    n : int
-        Number of nodes.
-    groups : sequence of ndarray
-        ``(g, k)`` nodes of each group. The diagonal is there in any case.
-    """
+    """Matrix ``(n, n)`` with the diagonal and all pairs of nodes in a group; groups ``(g, k)``."""
     total = sparse.identity(n, format="csr", dtype=np.int32)
     for nodes in groups:
         incidence = _incidence(n, nodes)
@@ -194,7 +173,7 @@ def adjacency(n: int, groups: Sequence[IntArray]) -> sparse.csr_matrix:
 
 
 def elements_of_nodes(n: int, elements: IntArray) -> tuple[IntArray, IntArray]:
-    """Where the elements of each of n nodes start ``(n + 1,)``, and the elements."""
+    """Start ``(n + 1,)`` of the elements of each of n nodes, and these elements."""
     around = _incidence(n, elements).tocsc()
     return around.indptr.astype(np.int64), around.indices.astype(np.int64)
 
@@ -216,7 +195,7 @@ def _coupled(
     around: IntArray,
     out: Positions,
 ) -> Positions:
-    """Write the columns of each row, unsorted, with the nodes of coupled elements; its pointer."""
+    """Write the unsorted columns of each row with the coupled elements; return the pointer."""
     n = len(pointer) - 1
     first = np.zeros(len(elements) + 1, dtype=np.int64)
     for g in range(len(pairs)):
@@ -331,7 +310,7 @@ def add_forces(out: FloatArray, nodes: IntArray, forces: FloatArray) -> None:
 
 
 def add_forces_at(out: FloatArray, points: Embedding, force: FloatArray) -> None:
-    """Add forces ``(k, 3)`` N at embedded points to those of the nodes ``out (n, 3)``."""
+    """Add forces ``(k, 3)`` N at embedded points to the nodal forces ``out (n, 3)``."""
     add_forces(out, points.nodes, points.weights[:, :, None] * force[:, None, :])
 
 
@@ -339,7 +318,7 @@ def add_forces_at(out: FloatArray, points: Embedding, force: FloatArray) -> None
 def scatter_blocks(
     data: FloatArray, positions: Positions, weights: FloatArray, blocks: FloatArray
 ) -> None:
-    """Add ``w_a w_b block`` for points ``(k, w)`` with one symmetric 3x3 block each to the data."""
+    """Add ``w_a w_b block`` to the data for points ``(k, w)`` with one symmetric block each."""
     for k in range(positions.shape[0]):
         for a in range(positions.shape[1]):
             if weights[k, a] == 0.0:

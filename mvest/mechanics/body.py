@@ -23,7 +23,7 @@ from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
 from mvest.mechanics.system import Loads, System
-from mvest.typing import BoolArray, FloatArray
+from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import checked_floats, checked_indices
 from mvest.valve.mesh.cells import box as box
 from mvest.valve.mesh.cells import local_faces
@@ -52,7 +52,7 @@ def simulate_body(
     parameters: Sequence[Parameter] = (),
     solver: str = "auto",
 ) -> Simulation:
-    """Simulate a body that is held at some nodes, pressed on some faces and pulled at some nodes.
+    """Simulate a body with fixed nodes, pressure on faces and forces on nodes.
 
     Parameters
     ----------
@@ -62,62 +62,60 @@ def simulate_body(
         ``(m, k)`` node indices in the order of :mod:`mvest.elements`.
     element_type : str
         ``tet4``, ``tet10``, ``hex18``, ``hex27``, ``wedge12`` or ``wedge18``. One layer of ``tet4``
-        is up to thirty times too stiff in bending; prefer the others. Where the body bends by more
-        than its thickness within a cell, all are too stiff (see the results on thin shells).
+        is up to thirty times too stiff in bending. All elements are too stiff if the body bends by
+        more than its thickness within a cell (see the results on thin shells).
     material : TransverselyIsotropic, sequence of them, or Law
-        One, or one per region; or a law of one's own, which has what
-        :class:`mvest.mechanics.Law` asks for, for all regions.
+        One material, one per region, or your own :class:`mvest.mechanics.Law` for all regions.
     times : array_like
         ``(s,)`` s, end times of the steps, increasing, > 0.
     fixed_nodes : array_like
         ``(h,)`` nodes that do not move.
     fixed_components : array_like, optional
-        ``(n, 3)`` bool, coordinates x, y, z of single nodes that do not change. Nodes on a plane of
-        symmetry normal to x have their first one fixed.
+        ``(n, 3)`` bool, single coordinates x, y, z that are fixed: on a plane of symmetry normal to
+        x the first one.
     pressure_faces : array_like, optional
-        ``(f, kf)`` nodes of the faces pressed on, normals out of the solid
+        ``(f, kf)`` nodes of the loaded faces, normals out of the solid
         (:func:`mvest.mechanics.body.outer_faces` finds all faces).
     pressure : float, callable or array_like
-        MPa, positive pushes against the normal: a constant, a function of the time (s), or a table
+        MPa, positive against the normal: a constant, a function of the time (s), or a table
         ``(t, 2)`` of times and pressures, linear between its rows and constant outside.
     forces : array_like or callable, optional
-        ``(n, 3)`` N on the nodes, which keep their direction: constant, or a function of the time
-        (s). A force on an edge or face of a quadratic element is not shared equally by its nodes.
+        ``(n, 3)`` N, dead forces on the nodes: constant, or a function of the time (s). The nodes
+        of an edge or face of a quadratic element do not share a force equally.
     fibre : array_like, optional
-        Direction of the fibre: one ``(3,)``, per node ``(n, 3)`` or per element and node
-        ``(m, k, 3)``. May be left out if all materials are isotropic; of a law that is not known.
+        Fibre direction: one ``(3,)``, per node ``(n, 3)`` or per element and node ``(m, k, 3)``.
+        Needed unless all materials are isotropic.
     region : array_like, optional
         ``(m,)`` material of each element; regions are called ``"0"``, ``"1"``, ...
     static : bool
-        Equilibrium at each time, without inertia and damping. The load of a step that is too long
-        is halved; it should therefore grow with the time.
+        Equilibrium at each time, without inertia and damping. Steps that fail are halved, so the
+        load should grow with the time.
     density : float
         t/mm^3.
     damping, newton : optional
         See :mod:`mvest.mechanics.integrate`; by default the paper's damping of 0.1 1/s and 0.1 s.
     parameters : sequence of Parameter
-        To differentiate by, for example ``Parameter("E_f.0", 6.23)`` or
+        Parameters of the derivatives, for example ``Parameter("E_f.0", 6.23)`` or
         ``Parameter("pressure_scale", 1.0)``.
     solver : str
-        ``auto``, ``pardiso`` or ``superlu``. What has solved stands in the result.
+        ``auto``, ``pardiso`` or ``superlu``. The result names the solver that was used.
 
     Returns
     -------
     Simulation
-        All frames ``(1 + completed steps, n, 3)`` mm, the given state first, and the reason why the
-        run ended; a run that does not converge is a result, not an exception.
+        Frames ``(1 + completed steps, n, 3)`` mm, the initial state first, and the reason why the
+        run ended. A run that does not converge is a result, not an exception.
 
     Raises
     ------
     InputError, GeometryError, MaterialError
-        If an array has a wrong shape, an index out of range or a value that is not finite; if times
-        do not increase; if an element is inverted, or a pressure face belongs to no element or
-        points into the solid; if a material needs a fibre that is not given, or is neither a
-        material nor a law.
+        An array has a wrong shape, an index out of range or a value that is not finite; times do
+        not increase; an element is inverted; a pressure face belongs to no element or points into
+        the solid; the material is invalid or needs a fibre.
 
     Examples
     --------
-    A sheet of one layer of solid-shells, clamped at its rim and inflated:
+    A sheet of solid-shells, clamped at its rim and inflated:
 
     >>> import numpy as np
     >>> from mvest.mechanics import TransverselyIsotropic, box, outer_faces, simulate_body
@@ -135,11 +133,18 @@ def simulate_body(
     mesh, law = _body(nodes, elements, element_type, material, fibre, region, pressure_faces)
     n = len(mesh.nodes)
     fixed = np.unique(checked_indices("fixed_nodes", np.asarray(fixed_nodes), n, (None,)))
+    single = (
+        np.zeros((n, 3), dtype=bool) if fixed_components is None else np.asarray(fixed_components)
+    )
+    if single.shape != (n, 3) or single.dtype != np.bool_:
+        raise InputError(
+            f"fixed_components: shape {single.shape} of {single.dtype}, expected ({n}, 3) of bool"
+        )
     system = System(
         Solid(mesh, law, density=density),
         pressure=PressureLoad(mesh.pressure_faces, mesh.reference.face),
         fixed_nodes=fixed,
-        fixed_components=_components(fixed_components, n),
+        fixed_components=single,
     )
     curve, pull = _pressure_curve(pressure), _force_curve(forces, n)
     held, ends = mesh.nodes[fixed], np.asarray(times, dtype=float)
@@ -172,13 +177,18 @@ def _body(
         n_regions = 1 if region is None else int(np.max(np.asarray(region), initial=0)) + 1
         law, directed = material, True
     else:
-        materials = _materials(material)
+        materials = tuple(material) if isinstance(material, Sequence) else (material,)
+        if not materials or not all(isinstance(m, TransverselyIsotropic) for m in materials):
+            raise MaterialError(
+                "material must be a TransverselyIsotropic, a sequence of them, or a law "
+                "(mvest.mechanics.Law)"
+            )
         n_regions, law = len(materials), BiotLaw.of(materials)
-        directed = not all(_is_isotropic(m) for m in materials)
+        directed = any(m != TransverselyIsotropic.isotropic(m.E_f, m.nu_fp) for m in materials)
     if region is None and n_regions > 1:
         raise InputError(f"{n_regions} materials need the region (m,) of each element")
     if fibre is None and directed:
-        raise InputError("fibre is needed: a material is not isotropic, or a law of one's own")
+        raise InputError("fibre is needed: the material is not isotropic, or a law of your own")
     direction = _unit(np.asarray((1.0, 0.0, 0.0) if fibre is None else fibre, dtype=float))
     mesh = SolidMesh(
         points,
@@ -192,29 +202,12 @@ def _body(
         else np.asarray(pressure_faces),
     )
     _check_pressure_faces(mesh)
-    return (mesh if fibre is not None else replace(mesh, fibre=_any_fibre(mesh))), law
-
-
-def _materials(
-    material: TransverselyIsotropic | Sequence[TransverselyIsotropic],
-) -> tuple[TransverselyIsotropic, ...]:
-    given = tuple(material) if isinstance(material, Sequence) else (material,)
-    if not given or not all(isinstance(m, TransverselyIsotropic) for m in given):
-        raise MaterialError(
-            "material must be a TransverselyIsotropic, a sequence of them, or a law "
-            "(mvest.mechanics.Law)"
-        )
-    return given
-
-
-def _is_isotropic(material: TransverselyIsotropic) -> bool:
-    return material == TransverselyIsotropic.isotropic(material.E_f, material.nu_fp)
-
-
-def _any_fibre(mesh: SolidMesh) -> FloatArray:
-    """Some direction ``(m, k, 3)`` within each layer: along the first reference axis."""
-    along = mesh.reference.gradient(mesh.reference.node_coordinates)[:, :, 0]
-    return _unit(np.einsum("mai,qa->mqi", mesh.nodes[mesh.elements], along))
+    if fibre is None:
+        # Any direction within the layers: along the first reference axis.
+        along = mesh.reference.gradient(mesh.reference.node_coordinates)[:, :, 0]
+        own = np.einsum("mai,qa->mqi", mesh.nodes[mesh.elements], along)
+        mesh = replace(mesh, fibre=_unit(own))
+    return mesh, law
 
 
 def _unit(direction: FloatArray) -> FloatArray:
@@ -222,17 +215,6 @@ def _unit(direction: FloatArray) -> FloatArray:
     if not np.all(length > 0) or not np.isfinite(direction).all():
         raise InputError("fibre has a length of zero or is not finite")
     return np.asarray(direction / length)
-
-
-def _components(fixed_components: ArrayLike | None, n: int) -> BoolArray:
-    if fixed_components is None:
-        return np.zeros((n, 3), dtype=bool)
-    fixed = np.asarray(fixed_components)
-    if fixed.shape != (n, 3) or fixed.dtype != np.bool_:
-        raise InputError(
-            f"fixed_components: shape {fixed.shape} of {fixed.dtype}, expected ({n}, 3) of bool"
-        )
-    return fixed
 
 
 def _force_curve(
@@ -261,7 +243,7 @@ def _pressure_curve(
 
 
 def _check_pressure_faces(mesh: SolidMesh) -> None:
-    """Each pressure face must be part of an element and point away from it."""
+    """Raise unless each pressure face belongs to an element and points away from it."""
     local = local_faces(mesh.element_type)
     known = np.sort(mesh.elements[:, local].reshape(-1, local.shape[1]), axis=1)
     owner = {face: k // len(local) for k, face in enumerate(map(tuple, known.tolist()))}

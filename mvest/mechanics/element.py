@@ -1,7 +1,7 @@
-"""The kernels of :mod:`mvest.mechanics.solid`: loops over elements, in arrays of elements.
+"""Element kernels of :mod:`mvest.mechanics.solid`.
 
-``gradients (e, q, k, 3)`` lie along the fibre frame, ``volumes (e, q)`` are those of the quadrature
-points; an enhanced strain is ``direction (e, q, 6)`` times ``polynomials (q, m)`` times alpha.
+``gradients (e, q, k, 3)`` are in the fibre frame; ``volumes (e, q)`` belong to the quadrature
+points. An enhanced strain is ``direction (e, q, 6)`` times ``polynomials (q, m)`` times alpha.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mvest.typing import FloatArray, IntArray
 
 VOIGT = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
-"""Component of a six-vector that an entry of a symmetric tensor is."""
+"""Component of a six-vector for each entry of a symmetric tensor."""
 
 
 @nb.njit(cache=True)
@@ -206,7 +206,7 @@ def add_tangents(
     positions: NDArray[np.int32],
     blocks: FloatArray,
 ) -> None:
-    """``K_ab = sum_q w g_a (dP/dF) g_b``, less what the enhanced strains take away."""
+    """Add ``K_ab = sum_q w g_a (dP/dF) g_b``, condensed by the enhanced strains."""
     n_e, n_q, n_a, _ = gradients.shape
     n_m = polynomials.shape[1]
     half, a = np.empty((9, 6)), np.empty((9, 9))

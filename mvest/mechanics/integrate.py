@@ -6,11 +6,11 @@ Backward Euler: with :math:`v_{n+1} = (x_{n+1} - x_n)/\Delta t` each step solves
           + f_{int}(x_{n+1}; \epsilon_n) - f_{ext}(x_{n+1}, t_{n+1}) = 0
 
 by Newton's method with the consistent tangent A. A static step drops inertia and damping. A step
-that fails (no convergence, leaflets through each other) is halved; a static one with contact, or
-from a moving body, is tried again after the body has had more time to come to rest. Nothing is ever
-accepted unconverged, except in the single-solve mode: one exact solve a step of the equations
-linearised where the body is, without what the pressure adds to the stiffness. There sensitivities
-are those of the linearised step at fixed stiffness, from the same factor: cheap, and not exact.
+that fails (no convergence, leaflets through each other) is halved; a static step with contact or
+from a moving body is repeated after the body has had more time to come to rest. Only converged
+steps are accepted, except in the single-solve mode: one exact linear solve per step, linearised at
+the current state and without the load stiffness of the pressure. Its sensitivities are those of the
+linearised step at fixed stiffness, with the same factor: cheap, but not exact.
 
 Sensitivities differentiate these discrete equations (Michaleris, Tortorelli and Vidal 1994, Int. J.
 Numer. Meth. Engng 37:2471): with the factorised A of the converged step, for each parameter m,
@@ -47,20 +47,20 @@ from mvest.mechanics.system import Evaluation, Loads, System
 from mvest.typing import FloatArray
 
 RUNAWAY = 1.5
-"""Times its own size that a body may be displaced by the iterations of one step, which have run
-away beyond it: nothing comes of them, and detecting collisions there needs any amount of memory."""
+"""Largest displacement within a step over the size of the body. Iterates beyond it have diverged,
+and collision detection there could need any amount of memory."""
 
 NEAR = 1e-3
-"""Relative residual from which the tangent no longer changes enough to be factorised again: solving
-with the last factor takes no more iterations of GMRES, or one more."""
+"""Relative residual below which the last factor also serves for the new tangent: GMRES then needs
+at most one more iteration."""
 
 DERIVATIVES = 1e-11
-"""Relative error of derivatives, as far as the solver can tell."""
+"""Estimated relative error of derivatives."""
 
 SETTLINGS = 2
-"""How often a body may be let rest before an equilibrium that is not found at once."""
+"""Largest number of rests before an equilibrium that is not found at once."""
 SETTLING_STEPS = 3
-"""Steps of one rest."""
+"""Time steps of one rest."""
 
 
 @dataclass(slots=True, eq=False)
@@ -71,8 +71,8 @@ class _State:
     dx: FloatArray  # (p, n, 3)
     dv: FloatArray
     d_strain: FloatArray  # (p, e, q, 6)
-    dt: float = 0.0  # of the step of time that led here, 0 at rest
-    move: FloatArray | None = None  # that is expected of the next step, if not by the velocity
+    dt: float = 0.0  # of the last dynamic step, 0 at rest
+    move: FloatArray | None = None  # expected in the next step, if not given by the velocity
 
 
 @dataclass(slots=True, eq=False)
@@ -81,11 +81,11 @@ class _Solved:
     evaluation: Evaluation
     residuals: list[float] = field(default_factory=list)
     pairs: ContactPairs | None = None
-    linearised: SolidState | None = None  # of a single solve, where it ends: what it was solved for
+    linearised: SolidState | None = None  # state predicted by a single solve
 
 
 class _Stride(NamedTuple):
-    """What a step is under: its loads, its length in s, and the damping over it."""
+    """Loads of a step, its length (s), and the damping over it."""
 
     loads: Loads
     dt: float
@@ -126,27 +126,26 @@ def simulate(
     damping, newton, solver : optional
         Defaults: the paper's damping, converged Newton, the fastest available solver.
     parameters : sequence of Parameter
-        To differentiate by.
+        Parameters of the derivatives.
     final_only : bool
-        Only the last frame is wanted. If its step is static, nothing before it needs to be
-        differentiated (an equilibrium has no history) or solved to more than the path's tolerance:
-        the frames before it are approximate and their derivatives zero.
+        Only the last frame is needed. If its step is static, the frames before it are solved to the
+        path tolerance only, without derivatives: an equilibrium has no history.
     initial_velocity : ndarray, optional
         ``(n, 3)`` mm/s.
     initial_positions : ndarray, optional
-        ``(n, 3)`` mm, where the body is at the beginning; default the reference positions.
+        ``(n, 3)`` mm; default the reference positions.
     initial_move : ndarray, optional
-        ``(n, 3)`` mm, what the first step is expected to move the body by. Its solution is looked
-        for from there, or from as far on the way as contact admits.
+        ``(n, 3)`` mm, expected displacement in the first step, as its initial guess. It is
+        shortened as contact requires.
     initial_time : float
-        s, of the beginning.
+        s.
     on_step : callable, optional
         Called with (time, Newton iterations so far) after each step, for progress.
 
     Returns
     -------
     Simulation
-        ``reason`` tells whether all steps were completed; frames hold the completed ones only.
+        Holds the completed frames, and the reason for the end.
 
     Raises
     ------
@@ -206,7 +205,7 @@ def simulate(
 
 
 class _Stepper:
-    """Advances a state; holds what stays the same over the steps."""
+    """Advances a state; holds the quantities common to all steps."""
 
     def __init__(
         self,
@@ -226,9 +225,9 @@ class _Stepper:
         self.solver = solver
         self.records: list[StepRecord] = []
         self.last_only = False
-        self.passing = False  # whether the steps now taken are not wanted for themselves
+        self.passing = False  # whether only later steps are of interest
         self._pairs: ContactPairs | None = None
-        self._detect = False  # whether collisions are looked for whatever the distances
+        self._detect = False  # whether collision detection always runs
 
     def advance(self, state: _State, start: float, step: Step) -> _State:
         """State at ``step.time``; halves the step where it fails."""
@@ -251,9 +250,9 @@ class _Stepper:
         return state
 
     def _settle(self, state: _State, start: float, time: float) -> _State:
-        """Equilibrium at ``time``; where it is not found from a moving body, the body rests first.
+        """Equilibrium at ``time``; if it is not found from a moving body, the body rests first.
 
-        Resting takes steps of time under the final loads, each twice as long as the one before.
+        A rest consists of time steps under the final loads, each twice as long as the last.
         """
         for level in range(SETTLINGS + 1):
             try:
@@ -268,7 +267,7 @@ class _Stepper:
         raise AssertionError("unreachable")
 
     def _try(self, state: _State, time: float, dt: float, static: bool, level: int) -> _State:
-        """State after one step, which is put on record; a failed one leaves nothing behind."""
+        """State after one step, which is recorded; a failed step leaves no trace."""
         enhanced = self.system.solid.enhanced_parameters
         try:
             new, solved = self._step(state, time, dt, static)
@@ -289,7 +288,7 @@ class _Stepper:
         if contact is not None and contact.intersects(contact.points(solved.x)):
             if self._detect:
                 raise _StepError(StepReason.INTERSECTION)
-            # Neighbours have folded through each other, which only detection keeps them from.
+            # Neighbours have folded through each other, which only detection prevents.
             self._detect = True
             try:
                 return self._step(state, end, dt, static)
@@ -341,7 +340,7 @@ class _Stepper:
 
         def factorize() -> None:
             nonlocal pairs
-            pairs = self._candidates(x)  # the line search may have tried other places since
+            pairs = self._candidates(x)  # the line search may have moved on since
             single = newton.single_solve
             blocks = system.tangent(x, loads, pairs, current.solid, load_stiffness=not single)
             near = residuals[-1] <= NEAR and len(residuals) > 1
@@ -358,7 +357,7 @@ class _Stepper:
             if iteration == newton.max_iterations and not converged:
                 break
             try:
-                # A converged state keeps the last factor, unless derivatives need its own.
+                # A converged state keeps the last factor, unless derivatives need a new one.
                 if not converged or self.parameters or iteration == 0:
                     factorize()
                 # A forcing term of the size of the residual keeps the convergence quadratic
@@ -373,8 +372,7 @@ class _Stepper:
                 raise _StepError(StepReason.SINGULAR)
             size = float(np.abs(d).max())
             if converged or size <= newton.smallest_move:
-                # What is left of the way is gone, so that the state depends on its start by less
-                # than the tolerance admits.
+                # The last correction makes the state independent of its start within tolerance.
                 return _Solved(x + d if size <= HARMLESS else x, current, residuals, pairs)
             before = x, current.solid
             x, current = self._line_search(x, d, current, pairs, evaluate)
@@ -387,7 +385,7 @@ class _Stepper:
         raise _StepError(StepReason.NO_CONVERGENCE)
 
     def _candidates(self, x: FloatArray) -> ContactPairs | None:
-        """Pairs that may touch at ``x``; the last search serves until points have moved too far."""
+        """Pairs that may touch at ``x``, from the last search unless points moved too far."""
         contact = self.system.contact
         if contact is None:
             return None
@@ -404,7 +402,7 @@ class _Stepper:
         pairs: ContactPairs | None,
         evaluate: Callable[[FloatArray], Evaluation],
     ) -> tuple[FloatArray, Evaluation]:
-        """Step along ``d``: admissible for contact, then backtracking on the slope r . d."""
+        """Step along ``d``, admissible for contact, with backtracking on the slope r . d."""
         contact = self.system.contact
         factor = min(1.0, self.newton.largest_move / max(float(np.abs(d).max()), 1e-300))
         if contact is not None and pairs is not None:
@@ -441,7 +439,7 @@ class _Stepper:
         for k, parameter in enumerate(self.parameters):
             d_stress = system.partial_stress(parameter, state, old.strain, rate)
             if parameter.kind == "damping" and not static:
-                # The law is damped by ``rate = beta / dt`` times the change of its strain.
+                # Damping acts with ``rate = beta / dt`` on the change of the strain.
                 at = Points(state.green, region, old.strain, 1 / dt)
                 d_stress = d_stress + solid.law.history_stress(at, old.strain - new.strain)
             if rate:
@@ -469,11 +467,11 @@ class _Stepper:
 def _largest_step(
     contact: Contact, pairs: ContactPairs, y: FloatArray, dy: FloatArray, *, detect: bool
 ) -> float:
-    """Share of the displacement ``dy`` that is free of collisions; a failed step where none is."""
+    """Share of the displacement ``dy`` without collisions; the step fails if there is none."""
     try:
         factor = contact.largest_step(pairs, y, dy, detect=detect)
     except MemoryError as error:
-        # What iterates that have run away sweep over is more than there is room for.
+        # Diverged iterates sweep over too large a volume.
         raise _StepError(StepReason.NO_CONVERGENCE) from error
     if factor == 0.0:
         raise _StepError(StepReason.NO_CONVERGENCE)

@@ -1,15 +1,14 @@
-r"""GMRES for several right-hand sides with a preconditioner that need not be accurate.
+r"""GMRES for several right-hand sides with an inaccurate preconditioner.
 
-Right preconditioning (Saad 1993, SIAM J. Sci. Comput. 14:461, the flexible variant): with a factor
-M of something near to A, each iteration adds :math:`z_k = M^{-1} v_k` to the space in which the
-solution is sought, and the residual that is made small is that of the given system. An error of M,
-be it that of single precision, therefore costs iterations and never the answer; under left
-preconditioning the residual stalls at the precision of M.
+Flexible right preconditioning (Saad 1993, SIAM J. Sci. Comput. 14:461): given a factor M of a
+matrix near A, each iteration adds :math:`z_k = M^{-1} v_k` to the solution space, and the residual
+of the given system is minimised. Errors of M, such as single precision, therefore cost iterations
+but not accuracy; with left preconditioning the residual would stall at the precision of M.
 
-How good the solution is says :math:`M^{-1} r`, an estimate of its error in which soft and stiff
-directions count alike, where r itself hardly knows the soft ones. It costs nothing: r is a
-combination of the :math:`v_k`, :math:`M^{-1} r` the same of the :math:`z_k`. Once it is small
-enough it is added to the solution, a last correction.
+The stopping criterion is :math:`M^{-1} r`, an estimate of the solution's error that weights soft
+and stiff directions equally, while r itself hardly contains the soft ones. It is free: r is a
+combination of the :math:`v_k`, and :math:`M^{-1} r` the same combination of the :math:`z_k`. Once
+small enough, it is added to the solution as a last correction.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy as np
 from mvest.typing import BoolArray, FloatArray
 
 REDUCTION = 1e-14
-"""Residual over that at a restart below which only the computed residual can say more."""
+"""Relative residual since the restart below which the recursion is no longer accurate."""
 
 TINY = 1e-300
 
@@ -39,24 +38,24 @@ def gmres(
     restart: int = 40,
     cycles: int = 3,
 ) -> tuple[FloatArray, BoolArray]:
-    """Solutions ``(p, n)`` of as many systems with one matrix, and which of them are any good.
+    """Solutions ``(p, n)`` of several systems with one matrix, and which of them converged.
 
     Parameters
     ----------
     product : callable
         ``(n,) -> (n,)``, the matrix times a vector.
     precondition : callable
-        ``(p, n) -> (p, n)``, the solutions of nearby systems.
+        ``(p, n) -> (p, n)``, approximate solutions.
     right : ndarray
         ``(p, n)``.
     tolerance : float
-        Preconditioned residual over preconditioned right-hand side that suffices.
+        Preconditioned residual over preconditioned right-hand side.
     exact : callable
         Whether a residual is round-off: (solution, residual, right-hand side), each ``(n,)``.
     restart : int
-        Iterations after which the space is begun anew.
+        Iterations before a restart.
     cycles : int
-        Spaces that may be tried.
+        Largest number of restarts.
     """
     solution = np.zeros_like(right)
     scale = np.zeros(len(right))
@@ -96,10 +95,10 @@ def gmres(
 
 
 class _Space:
-    """The Krylov space of one right-hand side, with the least squares problem in it.
+    """The Krylov space of one right-hand side and its least-squares problem.
 
-    The Hessenberg matrix is kept as its QR factorisation by Givens rotations; ``projected`` is Q^T
-    times the residual, whose last entry is what is left of it.
+    The Hessenberg matrix is stored as its QR factorisation by Givens rotations; ``projected`` is
+    Q^T times the initial residual, whose last entry is the remaining residual.
     """
 
     def __init__(self, residual: FloatArray, room: int) -> None:
@@ -114,7 +113,7 @@ class _Space:
 
     @property
     def reduction(self) -> float:
-        """Residual over that at the beginning."""
+        """Residual over the initial one."""
         return abs(self.projected[-1]) / float(np.linalg.norm(self.projected))
 
     def correction(self, direction: FloatArray) -> FloatArray:
@@ -149,7 +148,7 @@ class _Space:
         self.size = n + 1
 
     def solution(self) -> FloatArray:
-        """What makes the residual smallest, ``(n,)``."""
+        """The combination ``(n,)`` with the least residual."""
         m = self.size
         factors = np.linalg.solve(self.upper[:m, :m], self.projected[:m])
         return np.asarray(factors @ self.directions[:m])

@@ -1,8 +1,8 @@
-"""What the mechanics can be differentiated by: the names, their units, which are positive.
+"""The parameters of the mechanics: their names, units and ranges.
 
-A name is ``KIND`` or ``KIND.PART``: the part is a leaflet of the valve, a family of chordae, a
-papillary tip, or the leaflet and number of a mode. This is the one place that knows them; laws say
-which of the kinds of tissue they know (:attr:`mvest.mechanics.law.Law.kinds`).
+A name is ``KIND`` or ``KIND.PART``. The part is a leaflet of the valve, a family of chordae, a
+papillary tip, or the leaflet and number of a mode. Each law lists the kinds that it has
+(:attr:`mvest.mechanics.law.Law.kinds`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mvest.errors import InputError
 
 
 class NamePart(Enum):
-    """What the second half of a name stands for."""
+    """Meaning of the second part of a name."""
 
     NONE = ""
     REGION = "REGION"
@@ -30,14 +30,13 @@ class Kind(NamedTuple):
     Attributes
     ----------
     unit : str
-        Empty for what has none.
+        Empty if dimensionless.
     part : NamePart
-        What its names are made of.
     low, high : float
-        Ends of the range that a configuration may ask for.
+        Range that a configuration may use.
     description : str
     positive : bool
-        Whether it is positive by nature, so that it is estimated by its logarithm.
+        Whether it is positive, so that its logarithm is estimated.
     """
 
     unit: str
@@ -49,7 +48,7 @@ class Kind(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether it also exists without a part, for the whole valve."""
+        """Whether the name without a part exists, for the whole valve."""
         return self.part in (NamePart.NONE, NamePart.CHORDS)
 
 
@@ -78,11 +77,10 @@ KINDS: dict[str, Kind] = {
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter to differentiate by: its name and its current value.
+    """One parameter: its name and its current value.
 
-    Names are those of ``KINDS``: for example ``E_f.REGION`` (MPa; the region's other moduli follow
-    in proportion), ``field.REGION.K``, ``pressure_scale`` or ``chord_stiffness.FAMILY`` (factors,
-    which multiply).
+    Names are made of ``KINDS``: for example ``E_f.REGION`` (MPa; the region's other moduli are
+    proportional), ``field.REGION.K``, ``pressure_scale`` or ``chord_stiffness.FAMILY`` (factors).
     """
 
     name: str
@@ -105,19 +103,19 @@ class Parameter:
 
     @property
     def mode(self) -> int:
-        """Number of the mode of a field; -1 where the name has none that can be read."""
+        """Number of the mode of a field; -1 if the name has none."""
         number = self.part.rpartition(".")[2]
         return int(number) if self.kind == "field" and number.isdecimal() else -1
 
     def require(self, kinds: Collection[str]) -> None:
-        """Raise InputError where a law, which knows these kinds, does not know the parameter."""
+        """Raise InputError unless the parameter is of one of a law's kinds."""
         if self.kind not in kinds:
             known = known_names(kinds) if kinds else "none"
             raise InputError(f"parameter {self.name!r}: the law of its leaflet knows {known}")
 
 
 def known_names(kinds: Iterable[str] = ()) -> str:
-    """The names that there are, or those of some kinds, in words."""
+    """The names of all or of some kinds, as text."""
     words = []
     for kind in kinds or KINDS:
         known = KINDS[kind]
@@ -127,13 +125,7 @@ def known_names(kinds: Iterable[str] = ()) -> str:
 
 
 def kind_of(name: str) -> Kind:
-    """What kind of parameter ``name`` is.
-
-    Raises
-    ------
-    InputError
-        If it is none, or its part is missing or too much.
-    """
+    """The kind of the parameter ``name``; InputError if it is none or has a wrong part."""
     kind, _, part = name.partition(".")
     known = KINDS.get(kind)
     fits = known is not None and (
@@ -145,5 +137,5 @@ def kind_of(name: str) -> Kind:
 
 
 def is_positive(name: str) -> bool:
-    """Whether parameter ``name`` is positive by nature; InputError if there is none such."""
+    """Whether parameter ``name`` is positive; InputError if there is no such parameter."""
     return kind_of(name).positive

@@ -1,23 +1,22 @@
-r"""Derivatives of an equilibrium by the body's own geometry: where it was and what it was at rest.
+r"""Derivatives of an equilibrium with respect to the geometry of the body at rest.
 
-An equilibrium is r(x; q) = 0 in nodal positions x, where q displaces the nodes at rest, turns the
-fibres, moves supports and tips or thickens the sheets that touch. With the consistent tangent A
+An equilibrium is r(x; q) = 0 in nodal positions x, where q displaces the nodes at rest, rotates
+fibres, moves supports and tips, or thickens the sheets in contact. With the consistent tangent A
 
 .. math:: A \, dx/dq = -\partial_q r,
 
-so that a quantity costs a column of the residual and a back-substitution, and not an equilibrium.
+so that a quantity costs one right-hand side and one back-substitution instead of an equilibrium.
 
-The element's forces by its nodes at rest are central differences of its *residual*, the positions
-and everything outside the element fixed, and the enhanced strains eliminated anew each time: two
-evaluations of all elements for each of an element's coordinates, whatever the number of quantities.
-Contact, cables and supports are differentiated by hand. What is embedded in the mesh stays where it
-is in the material, and so do the pairs that may touch; how near to each other a pair was at rest,
-which limits its reach, changes with the geometry.
+Derivatives of an element's forces by its nodes at rest are central differences at fixed positions,
+with the enhanced strains eliminated anew each time: two evaluations of all elements for each
+coordinate of an element, independent of the number of quantities. Contact, cables and supports are
+differentiated by hand. Embedded points and candidate pairs stay in the material; the distance of a
+pair at rest, which limits its reach, changes with the geometry.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -31,31 +30,31 @@ from mvest.mechanics.system import Loads, System
 from mvest.typing import FloatArray, IntArray
 
 STEP = 1e-4
-"""Of the differences, in the size of the smallest edge at rest and in rad: their error, of second
-order, and round-off are both about 1e-8 of a derivative."""
+"""Difference step, relative to the smallest edge at rest or in rad: the second-order error and
+round-off are both about 1e-8 of a derivative."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RestVariation:
-    """How q independent quantities change a body at rest and its supports, each per unit.
+    """Changes of a body at rest and of its supports, per unit of each of q quantities.
 
     Attributes
     ----------
     nodes : (q, n, 3) mm
         Displacement of the nodes at rest.
     fibre : (q, e, k, 3) or None
-        Change of the fibre directions at the elements' nodes, across them.
+        Change of the fibre directions at the elements' nodes, across the fibres.
     areas, thickness : (q, c) mm² and mm, or None
-        Change of what belongs to each contact point.
+        Changes at the contact points.
     supports : (q, h, 3) mm or None
         Displacement of the supports' targets.
     tips : (q, t, 3) mm or None
     rest_length : (q, cables) or None
         Relative change of the cables' rest lengths.
     patches : (q, cables, s) or None
-        Change of the weights of the contact points that a cable's end is an average of.
+        Change of the weights of the contact points whose average is a cable's end.
     members : (cables, s) or None
-        These points, the same for all quantities.
+        These contact points, the same for all quantities.
     """
 
     nodes: FloatArray
@@ -74,39 +73,28 @@ class RestVariation:
     @classmethod
     def joined(cls, parts: Sequence[RestVariation]) -> RestVariation:
         """The quantities of several variations of one body, one after another."""
-
-        def one_by_one(name: str, shape: tuple[int, ...]) -> FloatArray:
-            none = [np.zeros((len(part), *shape)) for part in parts]
-            own = [getattr(part, name) for part in parts]
-            return np.concatenate([n if o is None else o for n, o in zip(none, own, strict=True)])
-
-        return cls._of(parts, one_by_one)
+        joined: dict[str, Any] = {}
+        for name, own in cls._given(parts).items():
+            shape = next(iter(own.values())).shape[1:]
+            blocks = [own.get(k, np.zeros((len(part), *shape))) for k, part in enumerate(parts)]
+            joined[name] = own[min(own)] if name == "members" else np.concatenate(blocks)
+        return cls(**joined)
 
     @classmethod
     def summed(cls, parts: Sequence[RestVariation]) -> RestVariation:
-        """As many quantities, each of which does what it does in all parts at once."""
-
-        def at_once(name: str, shape: tuple[int, ...]) -> FloatArray:
-            own = [values for part in parts if (values := getattr(part, name)) is not None]
-            return np.asarray(sum(own[1:], own[0]))
-
-        return cls._of(parts, at_once)
+        """As many quantities, each with its changes in all parts at once."""
+        summed: dict[str, Any] = {}
+        for name, own in cls._given(parts).items():
+            first, *others = own.values()
+            summed[name] = first if name == "members" else np.asarray(sum(others, first))
+        return cls(**summed)
 
     @classmethod
-    def _of(
-        cls,
-        parts: Sequence[RestVariation],
-        combined: Callable[[str, tuple[int, ...]], FloatArray],
-    ) -> RestVariation:
-        """What is combined of each field that a part has, given its name and an entry's shape."""
-        given: dict[str, Any] = {}
-        for field in fields(cls):
-            own = [values for part in parts if (values := getattr(part, field.name)) is not None]
-            if own and field.name == "members":
-                given["members"] = own[0]
-            elif own:
-                given[field.name] = combined(field.name, own[0].shape[1:])
-        return cls(**given)
+    def _given(cls, parts: Sequence[RestVariation]) -> dict[str, dict[int, Any]]:
+        """Field -> number of a part -> values, for the fields that a part has."""
+        own = {f.name: {k: getattr(p, f.name) for k, p in enumerate(parts)} for f in fields(cls)}
+        own = {name: {k: v for k, v in each.items() if v is not None} for name, each in own.items()}
+        return {name: each for name, each in own.items() if each}
 
 
 def vary_equilibrium(
@@ -117,19 +105,9 @@ def vary_equilibrium(
     variation: RestVariation,
     tolerance: float = EXACT,
 ) -> FloatArray:
-    """Derivatives ``(q, n, 3)`` mm of an equilibrium by what varies at rest.
+    """Derivatives ``(q, n, 3)`` mm of an equilibrium ``x (n, 3)`` mm by changes at rest.
 
-    Parameters
-    ----------
-    system : System
-    solver : LinearSolver
-        Factorises the tangent of the equilibrium.
-    x : (n, 3) mm
-        Nodal positions in equilibrium.
-    loads : Loads
-    variation : RestVariation
-    tolerance : float
-        Of each derivative, relative.
+    ``tolerance`` is the relative error of each derivative.
     """
     solid = system.solid
     pairs = system.search_contact(x)
@@ -169,7 +147,7 @@ def _solid_change(solid: Solid, x: FloatArray, variation: RestVariation) -> Floa
 
 
 class _Apart:
-    """The elements of a solid with nodes of their own, so that all may be varied at once."""
+    """The elements of a solid with separate nodes, so that all can be varied at once."""
 
     def __init__(self, solid: Solid, x: FloatArray) -> None:
         mesh = solid.mesh
@@ -188,16 +166,11 @@ class _Apart:
         self, nodes: FloatArray | None = None, fibre: FloatArray | None = None
     ) -> FloatArray:
         """Nodal forces ``(e, k, 3)`` N with other nodes at rest ``(e, k, 3)`` or other fibres."""
-        given = self.rest if nodes is None else nodes
-        mesh = replace(
-            self.mesh,
-            nodes=given.reshape(-1, 3),
-            fibre=self.mesh.fibre if fibre is None else fibre,
-        )
+        rest = self.mesh.nodes if nodes is None else nodes.reshape(-1, 3)
+        mesh = replace(self.mesh, nodes=rest, fibre=self.mesh.fibre if fibre is None else fibre)
         solid = Solid(mesh, self.solid.law, enhanced=self.solid.n_modes > 0)
         solid.enhanced_parameters = self.solid.enhanced_parameters.copy()
-        state = solid.evaluate(self.x, solid.initial_strain(), 0.0)
-        return solid.forces(state)
+        return solid.forces(solid.evaluate(self.x, solid.initial_strain(), 0.0))
 
     def by_rest_nodes(self) -> FloatArray:
         """Derivatives ``(e, 3 k, 3 k)`` N/mm of the forces by the nodes at rest."""
@@ -225,7 +198,7 @@ def _outside_change(
     variation: RestVariation,
     k: int,
 ) -> FloatArray:
-    """Change ``(n, 3)`` N of what acts on the solid by quantity ``k``, at fixed positions."""
+    """Change ``(n, 3)`` N of the forces on the solid by quantity ``k``, at fixed positions."""
     out = np.zeros((system.n, 3))
     if system.contact is not None and pairs is not None:
         points = system.contact.points
@@ -242,9 +215,7 @@ def _outside_change(
         add_forces_at(out, system.hinge.points, force)
     if system.cables is not None:
         cables, factors = system.cables, system.factors
-        pull, stiffness, _, by_length = cables.forces(
-            x, loads.tips, factors.chord_stiffness, factors.chord_rest_length
-        )
+        pull, stiffness, _, by_length = cables.forces(x, loads.tips, *factors.chordae)
         force = np.zeros((len(stiffness), 3))
         if variation.tips is not None:
             force -= np.einsum("cij,cj->ci", stiffness, variation.tips[k][cables.tip])

@@ -1,4 +1,4 @@
-"""Settings of the mechanics besides valve, mesh and unknowns: tissue, closure, numerics."""
+"""Settings of the mechanics: tissue, closure protocol, contact and numerics."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ class ExponentialTissue:
     c1, c2 : float
         Exponents of the isochoric deformation and of the fibres.
     mu : float
-        MPa, shear modulus at rest. The default is a third of the Young's modulus of 0.06 MPa that
-        excised leaflets have before they stiffen (Krishnamurthy et al. 2009, J. Biomech. 42:1909).
+        MPa, shear modulus at rest. The default is a third of the Young's modulus of 0.06 MPa of
+        excised leaflets before they stiffen (Krishnamurthy et al. 2009, J. Biomech. 42:1909).
     kappa : float
         MPa, bulk modulus.
     viscous : float
-        MPa, stiffness that the damping acts with.
+        MPa, viscous stiffness of the damping.
 
     Raises
     ------
@@ -82,12 +82,12 @@ class ExponentialTissue:
 
 
 EXPONENTIAL_KINDS = ("c0", "c1", "c2", "mu", "kappa")
-"""Coefficients that may be parameters."""
+"""Coefficients that can be parameters."""
 
 
 @dataclass(frozen=True, slots=True)
 class TissueSettings:
-    """Material of one region, apart from what is estimated of it.
+    """Material of one region. Parameters of an estimate override these values.
 
     Attributes
     ----------
@@ -96,21 +96,18 @@ class TissueSettings:
     nu : float
         Poisson ratio of the paper.
     reading : str
-        ``A`` or ``C`` (see :class:`mvest.mechanics.law.biot.PoissonReading`).
+        ``A`` or ``C`` (see :class:`mvest.mechanics.law.moduli.PoissonReading`).
     law : str
-        ``biot``, the linear law, to which all of the above belongs, ``corotational``, its usual
-        form on linear tetrahedra (:mod:`mvest.mechanics.law.biot`), ``exponential``
-        (:mod:`mvest.mechanics.law.exponential`), or ``stiffening``, on the way from the first to
-        the last.
+        ``biot``: the linear law, with all of the above. ``corotational``: its usual form on linear
+        tetrahedra (:mod:`mvest.mechanics.law.biot`). ``exponential``
+        (:mod:`mvest.mechanics.law.exponential`). ``stiffening``: a blend of linear and exponential.
     exponential : ExponentialTissue, optional
-        Coefficients of the exponential law, where they are not parameters; of a stiffening one
-        their common scale does not matter.
+        Coefficients of the exponential law; their common scale has no effect on a stiffening one.
     stiffening : float
-        How far on that way, where it is no parameter.
+        Share of the exponential law over that of the linear one in a blend.
     prestretch : float
-        How many times as long in its plane the open leaflet was seen as it would be free of stress
-        (:mod:`mvest.mechanics.law.regional`), where it is no parameter; not of the corotational
-        law.
+        In-plane stretch of the imaged open leaflet relative to its stress-free state
+        (:mod:`mvest.mechanics.law.regional`); not with the corotational law.
     """
 
     ratio: Ratio
@@ -141,21 +138,13 @@ class TissueSettings:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of parameters that the tissue has."""
+        """Kinds of the parameters of the tissue."""
         kinds = {"exponential": EXPONENTIAL_KINDS, "stiffening": ("E_f", "stiffening")}
         own = kinds.get(self.law, ("E_f",))
         return own if self.law == "corotational" else (*own, "prestretch")
 
     def coefficients(self, values: Mapping[str, float]) -> ExponentialTissue:
-        """Coefficients of the exponential law, some of them (by kind) replaced.
-
-        Raises
-        ------
-        InputError
-            If the tissue has none.
-        MaterialError
-            If some are inadmissible.
-        """
+        """Coefficients of the exponential law with some values (by kind) replaced."""
         if self.exponential is None:
             raise InputError("the tissue has no coefficients of the exponential law")
         return replace(self.exponential, **values)
@@ -168,12 +157,12 @@ class TissueSettings:
 
 @dataclass(frozen=True, slots=True)
 class ModulusField:
-    """What is known beforehand of how the modulus of a leaflet varies.
+    """Prior of the variation of the modulus within a leaflet.
 
     Attributes
     ----------
     correlation_length_mm : float
-        l, over which it is correlated.
+        l of the squared exponential covariance.
     std_log : float
         Standard deviation of log E_f at a point.
     modes : int
@@ -191,10 +180,10 @@ class ModulusField:
 
 @dataclass(frozen=True, slots=True)
 class StiffPatch:
-    """Tissue of another stiffness around one point of a leaflet.
+    """Tissue of different stiffness around a point of a leaflet.
 
-    ``log E_f`` is raised by ``log(factor) (1 - d^2 / radius^2)^2`` within ``radius`` of the centre,
-    d the distance in the reference frame: smooth, and of bounded extent.
+    ``log E_f`` is raised by ``log(factor) (1 - d^2 / radius^2)^2`` at distances d in the reference
+    frame below ``radius``.
 
     Attributes
     ----------
@@ -217,14 +206,14 @@ class StiffPatch:
         require_numbers(self, "patch", "radius_mm", "factor")
 
     def log_scale(self, points: FloatArray) -> FloatArray:
-        """What is added to log E_f ``(...)`` at points ``(..., 3)`` mm of the reference frame."""
+        """Increase of log E_f ``(...)`` at points ``(..., 3)`` mm of the reference frame."""
         d2 = np.sum((points - np.asarray(self.centre)) ** 2, axis=-1) / self.radius_mm**2
         return np.asarray(np.log(self.factor) * np.maximum(1 - d2, 0.0) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
 class ClosureProtocol:
-    """How the valve is closed, and when it is looked at.
+    """The course of a closure.
 
     Attributes
     ----------
@@ -233,18 +222,17 @@ class ClosureProtocol:
     ramp : float
         s over which pressure and boundary motion rise (smooth step).
     dt : float
-        s, time step during the ramp. The closed state does not depend on it where it is the only
-        one (the gate divides it by up to 16), so that a closure that is wanted for this state alone
-        takes the ramp in one step.
+        s, time step during the ramp. A unique closed state does not depend on it (the gate divides
+        it by up to 16), so that by default the ramp is one step.
     growth : float
-        Factor by which steps grow after the ramp, towards equilibrium.
+        Growth factor of the steps after the ramp.
     end : float
-        s at which the dynamic phase ends.
+        s, end of the dynamic phase.
     equilibrium : bool
         Whether a static step to exact equilibrium follows.
     curve : tuple of (s, share)
-        Pressure over its peak at increasing times, a monotone cubic between them and constant
-        outside; empty where it rises with the motion of the boundary.
+        Pressure over its peak at increasing times, a monotone cubic in between and constant
+        outside. If empty, the pressure rises with the motion of the boundary.
     """
 
     pressure_mmHg: Pressure = 120.0
@@ -304,11 +292,11 @@ class ContactSettings:
     reference_pressure : float
         Contact pressure p0 (MPa) at the reference distance.
     reference_distance : float
-        c0, the midsurface distance at p0 over the thickness.
+        c0, midsurface distance at p0 over the thickness.
     activation_distance : float
-        c_h, the midsurface distance over the thickness at which contact begins.
+        c_h, midsurface distance at which contact begins, over the thickness.
     active : bool
-        Without contact leaflets go through each other, as if they did not see each other.
+        Without contact leaflets pass through each other.
     """
 
     reference_pressure: Modulus = 0.016
@@ -328,7 +316,7 @@ class ContactSettings:
 
 @dataclass(frozen=True, slots=True)
 class MechanicsSettings:
-    """Everything about the mechanics that is not the valve, the mesh or an unknown.
+    """All settings of the mechanics except valve, mesh and parameters.
 
     Attributes
     ----------
@@ -343,11 +331,11 @@ class MechanicsSettings:
     support_stiffness : float
         N/mm per mm of annulus.
     patch_radius : float
-        mm over which a chord is spread at its insertion.
+        mm, radius of the patch over which a chord is spread at its insertion.
     solver : str
     fields : dict
-        Region name -> :class:`ModulusField`, where the modulus varies
-        within it; the coefficients ``field.REGION.K`` that are given no value are 0.
+        Region name -> :class:`ModulusField` of a varying modulus. Missing coefficients
+        ``field.REGION.K`` are 0.
     patches : dict
         Any name -> :class:`StiffPatch`, for simulations.
     """

@@ -1,31 +1,30 @@
 """The solid: strains, internal forces and tangents of all elements of a mesh.
 
-An element is written once, for every shape: it gets its tables from :mod:`mvest.elements` and its
-stress from a law, and knows neither global degrees of freedom nor what the law is. Kernels receive
-element arrays (element axis first) and return element arrays; :mod:`mvest.mechanics.assembly`
-scatters.
+One formulation serves all element shapes: tables come from :mod:`mvest.elements` and stresses from
+a law. Kernels take and return element arrays (element axis first);
+:mod:`mvest.mechanics.assembly` adds them up.
 
-Kinematics. Shape-function gradients are stored along the axes of the fibre frame Q of each
-quadrature point, ``g_a = Q^T dN_a/dX``, so that ``F Q = sum_a x_a g_a^T`` and the Green-Lagrange
-strain comes out in the fibre frame in which the law lives.
+Kinematics. Shape-function gradients are stored in the fibre frame Q of each quadrature point,
+``g_a = Q^T dN_a/dX``, so that ``F Q = sum_a x_a g_a^T`` and the Green-Lagrange strain is in the
+fibre frame of the law.
 
 Enhanced strains. Solid-shells add ``E = E(u) + M alpha`` with ``M = d p^T``: the strain
 ``d = (det J0 / det J) (G^3 x G^3)`` (G^3 the contravariant thickness vector at the centre) times
-the element's polynomials p. The parameters alpha of an element solve ``int M^T S dV = 0`` and are
-eliminated inside the element by Newton's method at every evaluation, so that to the outside the
-element has an energy of nodal positions only (its condensed tangent is the Schur complement). The
-modes integrate to zero against constant stress: the patch test holds. With the corotational law the
-strain is the linear one in a frame that turns with the element, which takes the place of F.
+the element's polynomials p. The parameters alpha of an element solve ``int M^T S dV = 0``. They are
+eliminated inside the element by Newton's method at every evaluation, so that its energy depends on
+nodal positions only (the condensed tangent is the Schur complement). The modes integrate to zero
+against constant stress: the patch test holds. With the corotational law the strain is the linear
+one in a frame that rotates with the element and replaces F.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mvest._compiling import announce_compilation
 from mvest.elements import Element
 from mvest.errors import InputError
 from mvest.mechanics.element import (
@@ -41,18 +40,20 @@ from mvest.mechanics.law.biot import BiotLaw
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
+announce_compilation()
+
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
-"""Entries of a symmetric tensor that the components of a six-vector are."""
+"""Tensor entries of the components of a six-vector."""
 ENHANCED_ITERATIONS = 12
 ENHANCED_TOLERANCE = 1e-11
 """Size of the last alpha correction (strain) at which the elimination stops."""
 LINEAR = 1e-7
-"""Size of an alpha correction that the stress follows linearly, and the tangent not noticeably."""
+"""Alpha corrections below this size change the stress linearly and the tangent negligibly."""
 
 
 @dataclass(slots=True, eq=False)
 class SolidState:
-    """Everything the solid knows at one set of nodal positions.
+    """State of the solid at given nodal positions.
 
     Attributes
     ----------
@@ -84,12 +85,12 @@ class Solid:
     density : float
         t/mm^3.
     enhanced : bool
-        Whether the enhanced thickness strain of solid-shells is switched on.
+        Whether solid-shells have their enhanced thickness strain.
 
     Attributes
     ----------
     enhanced_parameters : ndarray
-        ``(e, n_modes)`` alpha that the next evaluation starts from.
+        ``(e, n_modes)`` alpha from which the next evaluation starts.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ class Solid:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the enhanced parameters that the next evaluation would start from."""
+        """Set the enhanced parameters to zero."""
         self.enhanced_parameters = np.zeros((len(self.mesh.elements), self.n_modes))
 
     def initial_strain(self) -> FloatArray:
@@ -156,16 +157,9 @@ class Solid:
     def add_tangents(
         self, state: SolidState, positions: NDArray[np.int32], blocks: FloatArray
     ) -> None:
-        """Add the condensed consistent tangents, N/mm, to block data.
+        """Add the condensed consistent tangents, N/mm, to block data ``(n_blocks, 3, 3)``.
 
-        Parameters
-        ----------
-        state : SolidState
-        positions : ndarray
-            ``(e, k, k)`` where the blocks of the pairs of nodes lie in the data; negative where
-            the mirror image serves.
-        blocks : ndarray
-            ``(n_blocks, 3, 3)``.
+        ``positions (e, k, k)`` are those of the pairs of nodes, negative in the lower triangle.
         """
         # The corotational tangent is taken at fixed rotations: it has no geometric part.
         turned = self.rotations is not None
@@ -185,21 +179,15 @@ class Solid:
         return internal_forces(self.gradients, self.volumes, state.deformation, stress)
 
     def extrapolated(self, state: SolidState, dx: FloatArray) -> SolidState:
-        """The state with the strain and the stress that a move by ``dx (n, 3)`` mm leads to.
-
-        To first order; all else is as before the move.
-        """
+        """The state with strain and stress changed to first order by a move ``dx (n, 3)`` mm."""
         change = self.green_change(state, dx, np.zeros_like(state.stress))
         stress = state.stress + np.einsum("eqij,eqj->eqi", state.tangent, change)
         return replace(state, green=state.green + change, stress=stress)
 
     def condensed_forces(self, state: SolidState, d_stress: FloatArray) -> FloatArray:
-        """Nodal forces ``(e, k, 3)`` of a partial change of stress, alpha re-equilibrated.
+        """Nodal forces ``(e, k, 3)`` of a change of stress ``(e, q, 6)`` at fixed strain.
 
-        Parameters
-        ----------
-        d_stress : ndarray
-            ``(e, q, 6)`` partial derivative of S with respect to a parameter at fixed strain.
+        The enhanced strains are re-equilibrated.
         """
         if self.n_modes:
             change = self._enhanced_change(state, d_stress)
@@ -207,14 +195,9 @@ class Solid:
         return self._forces(state, d_stress)
 
     def green_change(self, state: SolidState, dx: FloatArray, d_stress: FloatArray) -> FloatArray:
-        """Total change of the Green-Lagrange strain ``(e, q, 6)``.
+        """Change ``(e, q, 6)`` of the Green-Lagrange strain by a move ``dx (n, 3)`` of the nodes.
 
-        Parameters
-        ----------
-        dx : ndarray
-            ``(n, 3)`` derivative of the nodal positions.
-        d_stress : ndarray
-            ``(e, q, 6)`` partial derivative of S at fixed strain.
+        ``d_stress (e, q, 6)`` is a simultaneous change of the stress at fixed strain.
         """
         d_green = strain_derivative(dx, self.mesh.elements, self.gradients, state.deformation)
         if self.n_modes:
@@ -233,11 +216,11 @@ class Solid:
 
 
 class EdgeRotations:
-    """Frames of linear tetrahedra that turn with their edges.
+    """Frames of linear tetrahedra that rotate with their edges.
 
-    The rotation is that of the matrix of edges from the first node, :math:`A = (x_1 - x_0, x_2 -
-    x_0, x_3 - x_0)`: the polar factor at x times the inverse of that at rest. It is the "polar"
-    form of SOFA's tetrahedra, and not the polar factor of the deformation gradient.
+    With the edges from the first node, :math:`A = (x_1 - x_0, x_2 - x_0, x_3 - x_0)`, the rotation
+    is the polar factor of A at x times the inverse of that at rest. This is the "polar" form of
+    SOFA's tetrahedra, not the polar factor of the deformation gradient.
 
     Parameters
     ----------
@@ -265,14 +248,9 @@ class EdgeRotations:
         return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
 
     def __call__(self, x: FloatArray, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Linear strain ``(e, 1, 6)`` in the turned frames, and these ``(e, 1, 3, 3)``.
+        """Linear strain ``(e, 1, 6)`` in the rotated frames, and these frames ``(e, 1, 3, 3)``.
 
-        Parameters
-        ----------
-        x : ndarray
-            ``(n, 3)`` mm.
-        deformation : ndarray
-            ``(e, 1, 3, 3)`` F in the fibre frame.
+        At nodal positions ``x (n, 3)`` mm, with ``deformation (e, 1, 3, 3)``, F in the fibre frame.
         """
         rotation = _polar(self._edges(x)) @ np.swapaxes(self._start, 1, 2)
         frames = rotation[:, None] @ self._frames
@@ -283,16 +261,10 @@ class EdgeRotations:
 
 
 def _polar(a: FloatArray) -> FloatArray:
-    """The rotation ``(e, 3, 3)`` that is nearest to each matrix, also where one is inverted."""
+    """The rotation ``(e, 3, 3)`` nearest to each matrix, also to an inverted one."""
     u, _, v = np.linalg.svd(a)
     u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
     return u @ v
-
-
-def kernels_are_compiled() -> bool:
-    """Whether the machine code of the kernels lies in numba's cache; if not, first use makes it."""
-    place = add_tangents.stats.cache_path
-    return place is not None and any(Path(place).glob("element.add_tangents-*.nbi"))
 
 
 def _fibre_gradients(mesh: SolidMesh, reference: Element) -> tuple[FloatArray, FloatArray]:

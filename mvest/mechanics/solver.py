@@ -1,8 +1,4 @@
-"""Sparse direct solvers behind one small interface.
-
-``PardisoSolver`` (Intel MKL, x86-64 only) is used where its wheel exists; ``SuperLUSolver`` (SciPy)
-everywhere else. Both factorise the same matrix and agree to round-off; a test compares them.
-"""
+"""Sparse direct solvers: PARDISO (Intel MKL, x86-64 only) if installed, or SciPy's SuperLU."""
 
 from __future__ import annotations
 
@@ -25,19 +21,19 @@ from mvest.mechanics.krylov import gmres
 from mvest.typing import BoolArray, FloatArray, IntArray
 
 EXACT = 1e-13
-"""Tolerance of a solution that is as good as double precision allows."""
+"""Tolerance of a solution as accurate as double precision allows."""
 ROUND_OFF = 1e-14
-"""Residual over the matrix times the solution that is no more than round-off."""
+"""Residual, over matrix times solution, that counts as round-off."""
 NEGLIGIBLE = 2e-5
-"""Largest entry of a block, over the geometric mean of those of the two diagonal blocks, up to
-which it is left out of the factor. A closed valve of 25 000 nodes takes 7 iterations of GMRES to
-1e-3 up to 1e-5 and 16 at 1e-4; with all blocks the factor is seven times the work."""
+"""A block is left out of the factor if its largest entry, over the geometric mean of those of both
+diagonal blocks, is below this. A closed valve of 25 000 nodes takes 7 GMRES iterations to 1e-3 for
+values up to 1e-5, and 16 at 1e-4; a factor of all blocks is seven times the work."""
 TOGETHER = 4
-"""Right-hand sides that are solved for in turns, with one call of PARDISO for all of them."""
+"""Right-hand sides per call of PARDISO."""
 SLACK = 1.3
 """Ratio of stored to needed blocks above which the symbolic analysis is repeated."""
 NESTED_FROM = 20_000
-"""Nodes from which nested dissection fills less than minimum degree."""
+"""Nodes from which nested dissection has less fill than minimum degree."""
 
 
 class LinearSolver(Protocol):
@@ -45,26 +41,25 @@ class LinearSolver(Protocol):
 
     @property
     def name(self) -> str:
-        """What solves, and what had to take its place."""
+        """The solver and its substitutes."""
 
     def factorize(self, matrix: BlockMatrix, *, near: bool = False) -> None:
-        """Factorise ``matrix``; a symbolic analysis serves while the pattern is the same object.
+        """Factorise ``matrix``; the symbolic analysis is reused for the same pattern object.
 
-        ``near``: it hardly differs from the last one, whose factor may serve where solutions are
-        improved by iteration.
+        If ``near``, the matrix hardly differs from the last one, whose factor may be reused by
+        iterative solvers.
         """
 
     def solve(self, right: FloatArray, tolerance: float = EXACT) -> FloatArray:
         """Solution of the same shape ``(n,)`` or ``(n, p)`` as ``right``.
 
-        ``tolerance`` is the error over the solution, as far as the factor can tell, that suffices;
-        direct solvers may do better.
+        ``tolerance`` is the estimated relative error; direct solvers may be more accurate.
         """
 
 
 @cache
 def _name_mkl() -> None:
-    """Tell pypardiso where MKL is: it would search the whole environment for each new solver."""
+    """Tell pypardiso where MKL is, so that it does not search the environment for each solver."""
     try:
         files = metadata.files("mkl") or []
     except metadata.PackageNotFoundError:
@@ -76,31 +71,23 @@ def _name_mkl() -> None:
 
 
 class PardisoSolver:
-    """MKL PARDISO on what matters of the symmetric part, GMRES for the rest.
+    """PARDISO for the main symmetric part of the matrix, GMRES for the whole.
 
-    Only the follower pressure at free edges makes the tangent unsymmetric, and only slightly; and
-    most of the couplings by contact, whose force falls with the fourth power of what is left of its
-    reach, are tiny, but fill the factor as much as strong ones do. So PARDISO factorises the
-    symmetric part (type -2: half the memory, several times faster than the unsymmetric type 11)
-    without the blocks below ``NEGLIGIBLE`` and in single precision, and right-preconditioned GMRES
-    (:mod:`mvest.mechanics.krylov`) solves with the whole matrix: the solution is that of the given
-    system to the requested tolerance, whatever the factor lacks.
+    Only follower pressure at free edges makes the tangent unsymmetric, and only slightly. Most
+    contact couplings are tiny, but cause as much fill as strong ones. So PARDISO factorises the
+    symmetric part (type -2: half the memory and several times faster than the unsymmetric type 11)
+    in single precision and without the blocks below ``NEGLIGIBLE``, and right-preconditioned GMRES
+    (:mod:`mvest.mechanics.krylov`) solves the full system to the requested tolerance. The symbolic
+    analysis, which costs a fraction of a factorisation, is repeated if other blocks become
+    relevant. A factor is reused for nearby matrices until GMRES fails with it.
 
-    The symbolic analysis, which works on blocks and costs a fraction of a factorisation, is
-    repeated when other blocks come to matter.
-
-    The factor of one matrix serves for those near to it as well, as in the last steps of Newton's
-    method and for derivatives; it is renewed where GMRES does not get to the end with it.
-
-    The condition of a thin shell's tangent is about 1e13 (its layer is squeezed 1e9 times less
-    easily than it bends). A factor of single precision says nothing about it: where GMRES does not
-    get to the end with one, this and all further matrices are factorised in double precision, and
-    where that is not enough, as with flat tetrahedra, with all their blocks, since without the
-    smallest ones such a matrix is not even positive definite at rest. With that the preconditioned
-    residual does not fall below 1e-5, however good the solution x is: it is all round-off. What
-    GMRES leaves is therefore judged by its backward error: x solves a system that is as near to the
-    given one as ``ROUND_OFF``, and nothing better can be had. Where it is not, SuperLU solves with
-    the whole matrix, and `name` says for how many matrices it did.
+    The condition of a thin shell's tangent is about 1e13, as its layer is 1e9 times stiffer across
+    than in bending; a single-precision factor is then useless. If GMRES fails, this and all further
+    matrices are factorised in double precision, and if that is not enough (flat tetrahedra), with
+    all blocks, without which such a matrix is not even positive definite. Even then the
+    preconditioned residual may be round-off above the tolerance. So a solution is also accepted if
+    its backward error is below ``ROUND_OFF``. Otherwise SuperLU solves with the whole matrix, and
+    `name` reports for how many matrices it did.
     """
 
     def __init__(self) -> None:
@@ -115,14 +102,14 @@ class PardisoSolver:
 
     @property
     def name(self) -> str:
-        """What has solved: ``pardiso``, and how often SuperLU had to take its place."""
+        """``pardiso``, and the number of matrices for which SuperLU replaced it."""
         times = f"{self._substituted} matri{'x' if self._substituted == 1 else 'ces'}"
         return f"pardiso, superlu for {times}" if self._substituted else "pardiso"
 
     def factorize(self, matrix: BlockMatrix, *, near: bool = False) -> None:
-        """Numeric factorisation, of a ``near`` matrix none; the symbolic one when blocks change.
+        """Numeric factorisation, skipped for a ``near`` matrix; symbolic if blocks change.
 
-        The matrix is not copied: its entries are needed until the last ``solve``.
+        The matrix is not copied: its entries must not change until the last ``solve``.
         """
         self._matrix = matrix
         self._stale = near and self._factor is not None and self._whole is None
@@ -138,7 +125,7 @@ class PardisoSolver:
             self._substitute(matrix)
 
     def _renew(self, matrix: BlockMatrix) -> None:
-        """Factorise, in the precision that is due."""
+        """Factorise in the current precision."""
         pattern = matrix.pattern
         if self._pattern is not pattern:
             self._pattern, self._kept = pattern, None
@@ -213,7 +200,7 @@ class PardisoSolver:
 
 
 class _Pardiso:
-    """MKL's PARDISO for symmetric matrices of 3x3 blocks, given by their upper triangle."""
+    """MKL's PARDISO for symmetric matrices of 3x3 blocks (upper triangle)."""
 
     def __init__(self) -> None:
         _name_mkl()
@@ -221,9 +208,9 @@ class _Pardiso:
 
         self._call_mkl = PyPardisoSolver(mtype=-2)._mkl_pardiso
         self._handle = np.zeros(64, dtype=np.int64)
-        # One-based numbers of MKL's manual: no defaults (1), ordering (2) chosen in `analyse`,
-        # pivots perturbed at 1e-8 (10), no scaling (11) and no matching (13), which blocks do not
-        # allow, Bunch-Kaufman pivots (21), single precision (28), 3x3 blocks (37).
+        # Numbers of MKL's manual, from one: no defaults (1), ordering (2) set in `analyse`, pivots
+        # perturbed at 1e-8 (10), no scaling (11) and matching (13) because of blocks,
+        # Bunch-Kaufman pivots (21), single precision (28), 3x3 blocks (37).
         self.settings = np.zeros(64, dtype=np.int32)
         for number, value in ((1, 1), (10, 8), (21, 1), (37, 3)):
             self.settings[number - 1] = value
@@ -234,7 +221,7 @@ class _Pardiso:
         return bool(self.settings[27])
 
     def analyse(self, blocks: _Blocks, ordering: int) -> None:
-        """Symbolic analysis; numeric factorisations read the same arrays again."""
+        """Symbolic analysis; numeric factorisations read the same arrays."""
         self._blocks = blocks
         self.settings[1] = ordering
         self.settings[27] = blocks.data.dtype == np.float32
@@ -256,7 +243,7 @@ class _Pardiso:
         """Solutions ``(p, n)``."""
         if not self.single:
             return self._call(33, right)
-        # Their size must be one that single precision knows.
+        # Scaled into the range of single precision.
         size = np.maximum(np.abs(right).max(axis=1, keepdims=True), 1e-300)
         return self._call(33, (right / size).astype(np.float32)) * size
 
@@ -286,7 +273,7 @@ class _Pardiso:
 
 
 def _pointer(array: NDArray[Any], kind: type[ctypes._SimpleCData[Any]] | None = None) -> Any:
-    """Where the array lies."""
+    """Address of the array."""
     if kind is None:
         return ctypes.c_void_p(array.ctypes.data)
     return array.ctypes.data_as(ctypes.POINTER(kind))
@@ -303,16 +290,10 @@ def _is_exact(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Blocks:
-    """Blocks of the upper triangle as PARDISO reads them, and where they come from.
+    """Blocks of the upper triangle in PARDISO's format.
 
-    Attributes
-    ----------
-    pointer, columns : ndarray
-        Block pattern, counted from one.
-    data : ndarray
-        ``(k, 3, 3)``, each block by columns: so MKL stores them when indices count from one.
-    here : ndarray
-        ``(k,)`` positions of the blocks in the matrix.
+    ``pointer`` and ``columns`` are the block pattern with indices from one; ``data (k, 3, 3)`` are
+    the blocks by columns, and ``here (k,)`` their positions in the matrix.
     """
 
     pointer: NDArray[np.int32]
@@ -324,7 +305,7 @@ class _Blocks:
     def of(
         cls, pattern: SparsityPattern, kept: BoolArray, precision: type[np.floating[Any]]
     ) -> _Blocks:
-        """Those of the pattern that are marked in ``kept (u,)``, still without their entries."""
+        """The blocks marked in ``kept (u,)``, without their entries."""
         here = np.flatnonzero(kept)
         pointer = np.searchsorted(here, pattern.pointer).astype(np.int32) + 1
         data = np.zeros((len(here), 3, 3), dtype=precision)
@@ -335,7 +316,7 @@ class _Blocks:
 def _significant(
     pointer: NDArray[np.int32], columns: NDArray[np.int32], blocks: FloatArray
 ) -> BoolArray:
-    """Which blocks of the upper triangle belong into the factor: see ``NEGLIGIBLE``."""
+    """Which blocks of the upper triangle belong to the factor: see ``NEGLIGIBLE``."""
     size, scale = np.empty(len(columns)), np.empty(len(pointer) - 1)
     for row in range(len(scale)):
         for k in range(pointer[row], pointer[row + 1]):
@@ -386,7 +367,7 @@ class SuperLUSolver:
 
 
 def linear_solver(name: str = "auto") -> LinearSolver:
-    """The solver called ``pardiso``, ``superlu`` or ``auto`` (PARDISO where it can be imported).
+    """The solver ``pardiso``, ``superlu`` or ``auto`` (PARDISO if installed).
 
     Raises
     ------

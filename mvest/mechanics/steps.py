@@ -48,18 +48,17 @@ class NewtonSettings:
     tolerance : float
         Norm of the residual over the norm of the largest force.
     path_tolerance : float
-        The same for steps that are only passed through, when the last frame alone is wanted and it
-        is an equilibrium, which no step before it enters.
+        The same for intermediate steps if only the final equilibrium is needed.
     max_iterations : int
     max_halvings : int
-        How often a failing step may be halved.
+        Largest number of halvings of a failing step.
     single_solve : bool
-        One exact linear solve per step, as SOFA does by default: from where the body is, without
-        the pressure's load stiffness; nothing is checked for convergence.
+        One exact linear solve per step, SOFA's default: linearised at the current state, without
+        load stiffness and without a check of convergence.
     largest_move : float
-        mm that a node may move in one iteration.
+        Largest move of a node in one iteration, mm.
     smallest_move : float
-        mm; a correction this small is round-off and counts as converged.
+        mm; a smaller correction is round-off and counts as converged.
     """
 
     tolerance: Tolerance = 1e-9
@@ -86,7 +85,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """What one accepted (sub)step cost.
+    """Statistics of one accepted (sub)step.
 
     Attributes
     ----------
@@ -97,7 +96,7 @@ class StepRecord:
     active_contacts : int
         Pairs within reach.
     halvings : int
-        How often the step was halved; of a static one, how often the body was let rest before it.
+        Halvings of the step, or rests before a static step.
     """
 
     time: float
@@ -122,7 +121,7 @@ class Simulation:
     reason : StepReason
     records : tuple of StepRecord
     solver : str
-        What solved the linear systems, and what took its place where that failed.
+        The solver of the linear systems, and its substitutes.
     """
 
     times: FloatArray
@@ -131,14 +130,6 @@ class Simulation:
     reason: StepReason
     records: tuple[StepRecord, ...]
     solver: str = ""
-
-    def __str__(self) -> str:
-        n, p = self.frames.shape[1], self.sensitivities.shape[1]
-        return (
-            f"{self.reason.value} at t = {self.times[-1]:.4g} s: {len(self.frames)} frames of "
-            f"{n} nodes, {p} sensitivities; {len(self.records)} steps, {self.iterations} Newton "
-            f"iterations{', solved by ' + self.solver if self.solver else ''}"
-        )
 
     @property
     def converged(self) -> bool:

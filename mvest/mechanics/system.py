@@ -1,6 +1,6 @@
 """All forces of a body at one instant: residual, consistent tangent and partial derivatives.
 
-The residual is written as internal minus external force, so that equilibrium is ``r(x) = 0``:
+The residual is the internal minus the external force, so that equilibrium is ``r(x) = 0``:
 ``r = f_solid + f_cables + f_contact + f_hinge + f_ties - p f_pressure``; the time integrator adds
 inertia and mass-proportional damping. The tangent is dr/dx, exact in every term.
 """
@@ -33,14 +33,14 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding
 
 CONTACT_MARGIN = 0.12
-"""A pair of elements enters the sparsity pattern this share of its reach before it touches."""
+"""Distance beyond its reach, over the reach, at which a pair enters the sparsity pattern."""
 
 _NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loads:
-    """What is prescribed at one instant.
+    """Prescribed loads and positions at one instant.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Loads:
     body_force : ndarray or None
         ``(n, 3)`` N dead nodal forces.
     tie_lengths : ndarray or None
-        ``(k,)`` mm lengths at which ties are without force; None where nothing is tied.
+        ``(k,)`` mm force-free lengths of the ties; None without ties.
     """
 
     pressure: float = 0.0
@@ -68,23 +68,21 @@ class Loads:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Factors:
-    """Factors on the nominal loads and chordae, all 1 by default.
-
-    Attributes
-    ----------
-    pressure : float
-    chord_stiffness, chord_rest_length : float or ndarray
-        For all chordae, or ``(c,)`` for each.
-    """
+    """Factors on pressure and chordae (for all, or ``(c,)`` for each)."""
 
     pressure: float = 1.0
     chord_stiffness: float | FloatArray = 1.0
     chord_rest_length: float | FloatArray = 1.0
 
+    @property
+    def chordae(self) -> tuple[float | FloatArray, float | FloatArray]:
+        """Factors on stiffness and rest length."""
+        return self.chord_stiffness, self.chord_rest_length
+
 
 @dataclass(slots=True, eq=False)
 class Evaluation:
-    """Residual (without inertia) and what is needed to differentiate it."""
+    """Residual (without inertia), its scale, and the state and blocks for its derivatives."""
 
     residual: FloatArray
     scale: float
@@ -93,7 +91,7 @@ class Evaluation:
 
 
 class System:
-    """A body with everything that acts on it.
+    """A body with all forces on it.
 
     Parameters
     ----------
@@ -106,7 +104,7 @@ class System:
         Nodes whose positions are prescribed.
     ties : Ties or None
     fixed_components : ndarray or None
-        ``(n, 3)`` bool, single coordinates that keep the value they begin with.
+        ``(n, 3)`` bool, single coordinates that keep their initial value.
     """
 
     def __init__(
@@ -148,13 +146,13 @@ class System:
         self._build_pattern(np.zeros((0, 2), dtype=np.int64))
 
     def retune(self, law: Law, factors: Factors) -> None:
-        """Exchange the law and the factors; everything that depends on the geometry stays."""
+        """Exchange the law and the factors only."""
         self.solid.law = law
         self.solid.reset()
         self.factors = factors
 
     def forget_contact(self) -> None:
-        """Drop what earlier contact has left in the sparsity pattern."""
+        """Remove all contact from the sparsity pattern."""
         self._build_pattern(np.zeros((0, 2), dtype=np.int64))
 
     # -- sparsity ---------------------------------------------------------------------------------
@@ -190,10 +188,9 @@ class System:
         return None if self.contact is None else self.contact.search(self.contact.points(x))
 
     def _contact_slots(self, contact: Contact, pairs: ContactPairs, y: FloatArray) -> IntArray:
-        """Where the groups of ``pairs`` lie in the contact positions; renews the pattern if needed.
+        """Positions of the groups of ``pairs`` in the contact pattern, rebuilt if needed.
 
-        The pattern holds the groups that touch and those that are about to, and nothing else:
-        entries that are always zero would fill the factor.
+        The pattern holds only groups that touch or are about to: zero entries would cause fill.
         """
         keys = pairs.hosts[:, 0] * len(self.solid.mesh.elements) + pairs.hosts[:, 1]
         touching = contact.touching(pairs, y)
@@ -245,10 +242,10 @@ class System:
         *,
         load_stiffness: bool = True,
     ) -> FloatArray:
-        """Blocks N/mm of the derivative of the residual that was evaluated with the same.
+        """Blocks N/mm of the derivative of the residual with the same arguments.
 
-        ``state`` is the solid's of that evaluation; the stress in it is only felt as the geometric
-        part of the stiffness. Without ``load_stiffness`` the pressure's part is left out.
+        ``state`` is the solid's state of that evaluation. Without ``load_stiffness`` the part of
+        the pressure is left out.
         """
         slots, y = None, None
         if self.contact is not None and pairs is not None:
@@ -271,19 +268,12 @@ class System:
     ) -> Iterator[tuple[Embedding, FloatArray, FloatArray]]:
         """Points of cables, hinge and ties, with their internal forces N and stiffness N/mm."""
         if self.cables is not None:
-            force, stiffness, *_ = self._cable_forces(self.cables, x, loads)
+            force, stiffness, *_ = self.cables.forces(x, loads.tips, *self.factors.chordae)
             yield self.cables.patches, force, stiffness
         if self.hinge is not None:
             yield self.hinge.points, self.hinge.forces(x, loads.hinge), self.hinge.blocks
         if self.ties is not None and loads.tie_lengths is not None:
             yield self.ties.spans, *self.ties.forces(x, loads.tie_lengths)
-
-    def _cable_forces(
-        self, cables: Cables, x: FloatArray, loads: Loads
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        return cables.forces(
-            x, loads.tips, self.factors.chord_stiffness, self.factors.chord_rest_length
-        )
 
     def matrix(self, blocks: FloatArray, mass_factor: float) -> BlockMatrix:
         """Tangent ``(3n, 3n)`` plus ``mass_factor`` times lumped mass; held rows are identity.
@@ -304,17 +294,8 @@ class System:
     ) -> FloatArray:
         """Partial derivative of the stress ``(e, q, 6)`` by the parameter, at fixed strain.
 
-        Parameters
-        ----------
-        parameter : Parameter
-        state : SolidState
-        previous, rate
-            Those that ``state`` was evaluated with.
-
-        Raises
-        ------
-        InputError
-            If there is no such parameter, or none of this body.
+        ``previous`` and ``rate`` are those of the evaluation of ``state``. InputError if the body
+        has no such parameter.
         """
         if kind_of(parameter.name).part not in (NamePart.REGION, NamePart.MODE):
             return np.zeros_like(state.stress)
@@ -327,18 +308,16 @@ class System:
         return self.solid.law.partial_stress(parameter, at, which=which, stress=state.stress)
 
     def partial_load(self, parameter: Parameter, x: FloatArray, loads: Loads) -> FloatArray:
-        """Partial derivative ``(n, 3)`` of the residual by the parameter, solid's part excluded."""
+        """Partial derivative ``(n, 3)`` of the residual without the solid's part."""
         kind_of(parameter.name)
         out = np.zeros((self.n, 3))
         if parameter.kind == "pressure_scale" and self.pressure is not None:
             add_forces(out, self.pressure.faces, -loads.pressure * self.pressure.forces(x))
         elif parameter.kind in ("chord_stiffness", "chord_rest_length") and self.cables is not None:
-            _, _, by_stiffness, by_length = self._cable_forces(self.cables, x, loads)
-            stiffness = parameter.kind == "chord_stiffness"
-            force = by_stiffness if stiffness else by_length
-            factors = self.factors
-            own = factors.chord_stiffness if stiffness else factors.chord_rest_length
-            # A chord's factor is a product: its derivative by one factor is the product over it.
+            which = int(parameter.kind == "chord_rest_length")
+            own = self.factors.chordae[which]
+            force = self.cables.forces(x, loads.tips, *self.factors.chordae)[2 + which]
+            # A chord's factor is a product: its derivative by one factor is the product over that.
             share = own * self.cables.members(parameter.part) / parameter.value
             patches = self.cables.patches
             weights = patches.weights * share[:, None]

@@ -1,7 +1,7 @@
-"""A valve hung into a solid mesh, with everything that acts on it.
+"""A valve in a solid mesh, with all its loads, supports and contact.
 
-All of it is defined in the reference frame and embedded, so that the same valve gives the same
-loads, contact and observations in every mesh.
+Everything is defined in the reference frame and embedded, so that loads, contact and observations
+do not depend on the mesh.
 """
 
 from __future__ import annotations
@@ -31,26 +31,24 @@ from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 
 
 class Pacing(Protocol):
-    """How pressure and the motion of the boundary run in time."""
+    """Pressure and motion of the boundary as functions of time."""
 
     def pressure(self, t: float, /) -> float:
         """Transmitral pressure (mmHg) at time ``t`` (s)."""
-        ...
 
     def phase(self, t: float, /) -> float:
         """Share of the closure at time ``t`` (s), from 0 (open) to 1 (closed)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldState:
-    """Conditions under which a closed valve is held in a further frame.
+    """Boundary conditions of a closed valve in a further frame.
 
     Attributes
     ----------
     pressure_mmHg : float
     annulus : (k, 3) mm
-        Where the annulus vertices of the *contact valve* are.
+        Of the annulus vertices of the *contact valve*.
     papillary_tips : (t, 3) mm
     """
 
@@ -72,16 +70,15 @@ def build_system(
     Parameters
     ----------
     valve : Valve
-        Carries chordae, annulus and motion.
+        With chordae, annulus and motion.
     contact_valve : Valve
-        The same valve in the resolution at which contact is sampled.
+        The same valve in the resolution of the contact samples.
     mesh : SolidMesh
     settings : MechanicsSettings
     values : mapping
         Parameter (:data:`mvest.mechanics.parameters.KINDS`) -> value, at least the modulus of each
         region.
     ties : TiedPoints, optional
-        Pairs of points that are held together, as by a clip.
 
     Raises
     ------
@@ -127,7 +124,7 @@ def build_system(
 
 
 def check_parameters(names: Iterable[str], valve: Valve, settings: MechanicsSettings) -> None:
-    """Refuse names that are no parameters of this valve under these settings; InputError."""
+    """Raise InputError for names that are no parameters of this valve with these settings."""
     tips = [f"tip{k}" for k in range(len(valve.papillary_tips))]
     parts = {
         NamePart.REGION: valve.surface.region_names,
@@ -162,10 +159,10 @@ def material_law(
     mesh : SolidMesh
     settings : MechanicsSettings
     values : mapping
-        Parameter -> value: ``E_f.REGION`` of each region that follows the linear law, and any of
-        the others; those that are no parameters of tissue are passed over.
+        Parameter -> value: ``E_f.REGION`` of each region with a linear law, and any others. Those
+        of other parts than tissue are ignored.
     variation : ModulusVariation, optional
-        From `variation_of`; by default every leaflet has the same moduli throughout.
+        From `variation_of`; by default the moduli are constant within each leaflet.
 
     Raises
     ------
@@ -180,7 +177,11 @@ def material_law(
         raise InputError("the corotational law is that of all regions of a mesh, or of none")
     together = [regions] if len(kinds) == 1 and "stiffening" not in kinds else zip(regions)
     laws = tuple(_law_of(own, settings, values) for own in together)
-    prestretch = _prestretch(mesh, settings, values)
+    prestretch = np.array(
+        [values.get(f"prestretch.{r}", settings.tissue[r].prestretch) for r in regions]
+    )
+    if not np.all(prestretch > 0.0):
+        raise InputError(f"prestretch of tissue = {prestretch.tolist()}, expected > 0")
     stretched = np.any(prestretch != 1.0) or any(name.startswith("prestretch.") for name in values)
     if variation is None and not stretched and len(laws) == 1:
         return laws[0]
@@ -188,25 +189,10 @@ def material_law(
     return LeafletLaw(laws, mesh.region, prestretch, scale, variation)
 
 
-def _prestretch(
-    mesh: SolidMesh, settings: MechanicsSettings, values: Mapping[str, float]
-) -> FloatArray:
-    """Of each region ``(r,)``; InputError if one is not positive."""
-    found = np.array(
-        [
-            values.get(f"prestretch.{region}", settings.tissue[region].prestretch)
-            for region in mesh.region_names
-        ]
-    )
-    if not np.all(found > 0.0):
-        raise InputError(f"prestretch of tissue = {found.tolist()}, expected > 0")
-    return found
-
-
 def _law_of(
     regions: tuple[str, ...], settings: MechanicsSettings, values: Mapping[str, float]
 ) -> Law:
-    """The law of regions whose tissue is of one kind, as of a body of these regions."""
+    """The law of a body of these regions, whose tissue is of one kind."""
     for region in regions:
         tissue = settings.tissue.get(region)
         if tissue is None or (tissue.law != "exponential" and f"E_f.{region}" not in values):
@@ -237,7 +223,7 @@ def _law_of(
 def variation_of(
     valve: Valve, mesh: SolidMesh, settings: MechanicsSettings
 ) -> ModulusVariation | None:
-    """How the settings let the modulus vary within the leaflets, at the mesh's points."""
+    """Variation of the modulus within the leaflets, at the mesh's points; None if constant."""
     if not settings.fields and not settings.patches:
         return None
     modes = {
@@ -252,7 +238,7 @@ def variation_of(
 
 
 def retune(system: System, settings: MechanicsSettings, values: Mapping[str, float]) -> None:
-    """Give a system of a valve other values of its parameters; see `build_system`."""
+    """Set other parameter values in a valve's system; see `build_system`."""
     assert system.cables is not None
     old = system.solid.law
     variation = old.variation if isinstance(old, LeafletLaw) else None
@@ -261,7 +247,7 @@ def retune(system: System, settings: MechanicsSettings, values: Mapping[str, flo
 
 
 def factors_of(cables: Cables, values: Mapping[str, float]) -> Factors:
-    """The factors on pressure and cables among the values; InputError if a part is unknown."""
+    """Factors on pressure and cables from the values; InputError if a part is unknown."""
     return Factors(
         values.get("pressure_scale", 1.0),
         cables.factor("chord_stiffness", values),
@@ -274,7 +260,7 @@ def patch_members(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Leaflet ends of the chordae: averages over material points within ``radius`` mm.
 
-    Weights ``area (1 - (d / radius)^2)^2``, of fixed physical size whatever the mesh.
+    The weights are ``area (1 - (d / radius)^2)^2``.
 
     Returns
     -------
@@ -283,8 +269,7 @@ def patch_members(
     weights : (c, s)
         Rows sum to one.
     slope : (c, s, 3) 1/mm
-        Derivatives of the weights by the place of the insertion, before rows are made to sum to
-        one again; see `patch_change`.
+        Derivatives of the weights by the insertion, without normalisation; see `patch_change`.
     """
     vertices, areas = valve.surface.vertices, valve.surface.areas
     rows = []
@@ -317,7 +302,7 @@ def patch_change(
     ----------
     weights, slope : (c, s) and (c, s, 3)
     ends : (q, c, s, 3) mm
-        Displacement of the insertion against that of each member.
+        Displacement of the insertion relative to each member.
     log_areas : (q, c, s)
         Relative change of the areas of the members.
     """
@@ -326,7 +311,7 @@ def patch_change(
 
 
 def _support(mesh: SolidMesh, valve: Valve, settings: MechanicsSettings) -> Hinge:
-    """Hinge or clamp along the annulus, with a fixed stiffness per length."""
+    """Hinge or clamp along the annulus, of a given stiffness per length."""
     surface, loop = valve.surface, valve.annulus
     middle = surface.vertices[loop]
     half = 0.5 * surface.thickness[loop, None] * surface.normals[loop]
@@ -338,11 +323,9 @@ def _support(mesh: SolidMesh, valve: Valve, settings: MechanicsSettings) -> Hing
         groups = np.stack([np.arange(n), np.arange(n) + n, np.arange(n) + 2 * n], axis=1)
         simpson = np.tile([1 / 6, 4 / 6, 1 / 6], (n, 1))
         return Hinge(three.average(simpson, groups), share)
-    if settings.support == "clamp":
-        faces = np.concatenate([np.arange(n), np.arange(n) + 2 * n])
-        points = Embedding(three.nodes[faces], three.weights[faces], three.host[faces])
-        return Hinge(points, np.tile(0.5 * share, 2))
-    raise InputError(f"annulus support {settings.support!r}, expected hinge or clamp")
+    faces = np.concatenate([np.arange(n), np.arange(n) + 2 * n])
+    points = Embedding(three.nodes[faces], three.weights[faces], three.host[faces])
+    return Hinge(points, np.tile(0.5 * share, 2))
 
 
 def boundary_loading(
@@ -369,12 +352,12 @@ def boundary_loading(
 def held_loading(
     system: System, contact_valve: Valve, state: HeldState
 ) -> Callable[[float], Loads]:
-    """Time -> the loads of a held frame, which do not change.
+    """Time -> the constant loads of a further frame.
 
     Raises
     ------
     InputError
-        If the frame's annulus or tips are not those of the valve.
+        If the numbers of annulus points or tips are not those of the valve.
     """
     rest = contact_valve.motion.annulus[0]
     for name, given, own in (
@@ -391,9 +374,9 @@ def held_loading(
 def _loads(
     system: System, pressure_mmHg: float, moved: FloatArray, tips: FloatArray, phase: float
 ) -> Loads:
-    """Loads with the annulus ``moved (k, 3)`` mm from its place at rest, and tips ``(t, 3)`` mm.
+    """Loads with the annulus ``moved (k, 3)`` mm from rest, and tips ``(t, 3)`` mm.
 
-    Ties go from their length at rest, where they are without force, to that in the closed valve.
+    The force-free lengths of ties run from those at rest to those in the closed valve.
     """
     assert system.hinge is not None
     nodes, lengths = system.solid.mesh.nodes, None

@@ -1,9 +1,8 @@
-"""From a case to its moduli: the generic valve, the personalised one, and what is known of both.
+"""Personalisation: from a case to its moduli, with their uncertainty.
 
-The chain of one case. The model is built from the reference frame, its chordae and the tracked
-boundary. What is not known besides the moduli (pressure, rest lengths and stiffness of the chordae,
-a rigid displacement between the tracked boundary and the leaflets) is estimated with a prior, or
-left fixed, as each unknown says. Frames that are held out are predicted, never shown.
+The model of a case is built from the reference frame, its chordae and the tracked boundary.
+Nuisances (pressure, rest lengths and stiffness of the chordae, a rigid displacement between tracked
+boundary and leaflets) are estimated with priors or fixed. Held-out frames are only predicted.
 """
 
 import lazy_loader

@@ -5,7 +5,7 @@ from .design import expect_case as expect_case
 from .model import build_model as build_model
 from .model import gate_case as gate_case
 from .record import record_of_case as record_of_case
-from .result import FrameDistance as FrameDistance
+from .result import FrameComparison as FrameComparison
 from .result import Personalised as Personalised
 from .settings import CaseMesh as CaseMesh
 from .settings import PaperSettings as PaperSettings

@@ -1,46 +1,29 @@
-"""From a case to its moduli: generic valve, estimation, comparison, what is known of it."""
+"""Personalisation of a case: generic valve, estimation, comparison with its frames, details."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mvest.cases.case import Frame, Role, ValveCase
+from mvest.cases.case import Role, ValveCase
 from mvest.closure.model import ClosureModel
 from mvest.estimation.estimate import OnIterate
-from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import Prediction
 from mvest.observation.surfaces import surface_distance
 from mvest.personalisation.estimation import (
     CaseEstimate,
     CaseProblem,
+    LinearisationPoint,
     OnStep,
-    Place,
     estimate_all,
-    sampled,
 )
-from mvest.personalisation.known import (
-    LinearModel,
-    data_alone,
-    derived_quantities,
-    narrower,
-    strains,
-    variance_shares,
-)
+from mvest.personalisation.known import known_of, law_share
 from mvest.personalisation.model import held_state
-from mvest.personalisation.result import (
-    FrameDistance,
-    Known,
-    Personalised,
-    geometry_shifts,
-    law_share,
-)
+from mvest.personalisation.result import FrameComparison, Personalised
 from mvest.personalisation.settings import PersonaliseSettings, default_settings
 from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
@@ -56,15 +39,15 @@ def personalise(
 ) -> Personalised:
     """Estimate the unknowns of a case.
 
-    Numerical failure is part of the result, with its reason; only inadmissible input raises.
+    A numerical failure is part of the result, with its reason; only inadmissible input raises.
 
     Parameters
     ----------
     case : ValveCase
     settings : PersonaliseSettings, optional
-        By default as `default_settings` has them.
+        Default: `default_settings`.
     store : Path, optional
-        Where an unstructured mesh and closed states are kept.
+        Cache of unstructured meshes and closed states.
     on_step : callable, optional
         Progress, see :class:`mvest.closure.model.ClosureModel`.
     on_iterate : callable, optional
@@ -72,195 +55,108 @@ def personalise(
     """
     settings = default_settings(case) if settings is None else settings
     problem = CaseProblem.of(case, settings, store, on_step, on_iterate)
-    seconds: dict[str, float] = {}
-
-    @contextmanager
-    def timed(part: str) -> Iterator[None]:
-        began = time.perf_counter()
-        yield
-        seconds[part] = seconds.get(part, 0.0) + time.perf_counter() - began
-
-    with timed("generic"):
-        generic = problem.generic()
-    if generic.prediction.converged and case.error_samples is not None:
-        with timed("geometry"):
-            generic = sampled(generic)
-    # Held-out frames are gone to from the closed valve that was found last.
+    generic = problem.generic()
     before: dict[str, FloatArray] = {}
-    with timed("held_out"):
-        if generic.prediction.converged:
-            before = predicted_frames(problem, generic, generic.m, generic.prediction.y)
+    if generic.prediction.converged:
+        if case.error_samples is not None:
+            generic = generic.sampled()
+        # Held-out frames start from the last closed valve, so they come before other closures.
+        before = predicted_frames(problem, generic, generic.m, generic.prediction.y)
     estimate = estimate_all(problem, generic)
-    result, place = estimate.result, estimate.place
-    seconds["estimate"] = result.seconds
-    frames, known, confirmed = ComparedFrames({}, {}, {}, ()), Known(), None
-    if before and result.estimate is not None and result.fitted is not None:
-        with timed("held_out"):
-            after = predicted_frames(problem, place, result.estimate, result.fitted)
-            frames = compare_frames(problem, before, after)
-        with timed("known"):
-            known = known_of(problem, estimate)
-        if settings.confirm:
-            with timed("confirm"):
-                confirmed = largest_difference_anew(problem, estimate)
-    # From here on with geometry and law as they are stated, known exactly.
-    stated = Place(
-        problem.stated,
-        place.errors.as_stated(),
-        generic.m,
-        generic.prediction,
-    )
-    moduli_only = paper = None
-    if settings.moduli_only:
-        moduli_only = problem.estimate_moduli(
-            stated,
-            IteratedFilter(settings.tolerance, max_iterations=settings.max_iterations),
-            stated.errors.observation(),
-            log=True,
-        )
-        seconds["moduli_only"] = moduli_only.seconds
-    if settings.paper is not None:
-        paper = problem.estimate_as_paper(stated, settings.paper)
-        seconds["paper"] = paper.seconds
-    return Personalised(
+    result, point = estimate.result, estimate.point
+    found = Personalised(
         case=case,
         settings=problem.settings,
-        mesh=place.closure.model.mesh,
+        mesh=point.closure.model.mesh,
         result=result,
-        moduli_only=moduli_only,
-        paper=paper,
-        distances=frames.distances,
-        generic=frames.generic,
-        registered=frames.registered,
-        fitted=frames.fitted,
-        known=known,
-        confirmed_mm=confirmed,
-        seconds=seconds,
-        error_samples=0 if place.errors.frame_samples is None else len(place.errors.frame_samples),
+        alternatives={},
+        error_samples=0 if point.errors.frame_samples is None else len(point.errors.frame_samples),
         unaccounted=estimate.unaccounted,
         moved=estimate.moved,
     )
-
-
-def known_of(problem: CaseProblem, estimate: CaseEstimate) -> Known:
-    """What an estimate knows and what limits it, to first order about it."""
-    filtered = estimate.result.filtered
-    assert filtered is not None
-    model = LinearModel.of(filtered, estimate.errors)
-    return Known(
-        quantities=(
-            *derived_quantities(filtered),
-            *strains(problem, estimate, model),
-        ),
-        data_alone=data_alone(filtered),
-        shares=variance_shares(model),
-        narrower=narrower(problem, model),
-        geometry=geometry_shifts(problem, estimate),
-        law_share=law_share(estimate),
+    if before and result.estimate is not None and result.fitted is not None:
+        after = predicted_frames(problem, point, result.estimate, result.fitted)
+        found = replace(
+            found,
+            frames=compare_frames(problem, before, after),
+            details=known_of(problem, estimate),
+            law_share=law_share(estimate),
+            confirmed_mm=largest_difference_anew(problem, estimate) if settings.confirm else None,
+        )
+    stated = LinearisationPoint(
+        problem.stated, point.errors.as_stated(), generic.m, generic.prediction
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ComparedFrames:
-    """Frames that both the generic and the fitted valve have, ``(n, 3)`` mm each.
-
-    Attributes
-    ----------
-    generic, registered, fitted : mapping
-        Frame -> vertices of the generic valve, the same laid on the closed frame, the fitted valve.
-    distances : tuple of FrameDistance
-    """
-
-    generic: Mapping[str, FloatArray]
-    registered: Mapping[str, FloatArray]
-    fitted: Mapping[str, FloatArray]
-    distances: tuple[FrameDistance, ...]
+    return replace(found, alternatives=problem.alternatives(stated))
 
 
 def predicted_frames(
-    problem: CaseProblem, place: Place, m: FloatArray, closed: FloatArray
+    problem: CaseProblem, point: LinearisationPoint, m: FloatArray, closed: FloatArray
 ) -> dict[str, FloatArray]:
-    """All frames of the closed valve as they are predicted to be seen, ``(n, 3)`` mm each.
+    """Predicted vertices ``(n, 3)`` mm of all fitted and held-out frames, as observed.
 
     Parameters
     ----------
     problem : CaseProblem
-    place : Place
-        Whose closure predicts.
+    point : LinearisationPoint
+        Its closure predicts.
     m : (p,)
     closed : array
         Predicted frames at ``m``, stacked, the closed one last.
     """
-    closure, fitted, case = place.closure, problem.fitted, problem.case
-    n = len(case.surface.vertices)
-    shown = closed.reshape(-1, n, 3)[-len(fitted.frames) :]
+    closure, fitted, case = point.closure, problem.fitted, problem.case
+    shown = closed.reshape(-1, len(case.surface.vertices), 3)[-len(fitted.frames) :]
     frames = {frame.name: points for frame, points in zip(fitted.frames, shown, strict=True)}
-    # Their annulus and tips are off as those of the fitted frames.
+    # Annulus and tips have the same errors as in the fitted frames.
     further = {
         frame.name: closure.held(held_state(problem.stated.model, frame)) for frame in case.held_out
     }
-    states = list(further.values())
-    if states:
-        registered = closure.registered
-        if closure.frames is not None:
-            states = closure.frames.under(registered.own(m), further)
-        held = closure.model.held(registered.mechanical(m), states)
-        for frame, points in zip(case.held_out, held, strict=True):
-            if points is not None:
-                frames[frame.name] = registered.seen(points, m)
-    return frames
+    if not further:
+        return frames
+    registered, states = closure.registered, list(further.values())
+    if closure.frames is not None:
+        states = closure.frames.under(registered.own(m), further)
+    held = closure.model.held(registered.mechanical(m), states)
+    found = {name: points for name, points in zip(further, held, strict=True) if points is not None}
+    return frames | {name: registered.seen(points, m) for name, points in found.items()}
 
 
 def compare_frames(
     problem: CaseProblem, generic: Mapping[str, FloatArray], fitted: Mapping[str, FloatArray]
-) -> ComparedFrames:
-    """How far the frames that both valves have are from where they were seen."""
-    case = problem.case
-    closed = case.frame(Role.CLOSED)
-    turn, origin, target = _alignment(problem, closed, generic[closed.name])
-    registered = {name: (points - origin) @ turn.T + target for name, points in generic.items()}
-    # The closed frame first, wherever others are fitted with it.
-    shown = sorted(case.frames, key=lambda f: bool(case.fitted) and f is not closed)
-    distances = [
-        FrameDistance(
-            frame.name,
-            frame.role in (Role.CLOSED, Role.FITTED),
-            *(
-                _distance(problem, frame, positions[frame.name])
-                for positions in (generic, registered, fitted)
-            ),
-        )
-        for frame in shown
-        if frame.name in generic and frame.name in fitted
-    ]
-    return ComparedFrames(generic, registered, fitted, tuple(distances))
-
-
-def _alignment(
-    problem: CaseProblem, closed: Frame, generic: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Turn, origin and its target that lay the generic closed valve on the closed frame."""
-    if not problem.fitted.corresponding:
-        # Without correspondence: the displacement is that of the prior, none.
-        return np.eye(3), np.zeros(3), np.zeros(3)
-    origin, target = generic.mean(axis=0), closed.vertices.mean(axis=0)
-    turn, _ = Rotation.align_vectors(closed.vertices - target, generic - origin)
-    return turn.as_matrix(), origin, target
-
-
-def _distance(problem: CaseProblem, frame: Frame, positions: FloatArray) -> FloatArray:
-    if problem.settings.correspondence and frame.corresponds:
-        return np.asarray(np.linalg.norm(positions - frame.vertices, axis=1))
-    return surface_distance(frame.vertices, positions, problem.case.surface.triangles)
+) -> tuple[FrameComparison, ...]:
+    """Compare observed frames with generic and fitted valve ``(n, 3)`` mm, if both predict them."""
+    case, closed = problem.case, problem.case.frame(Role.CLOSED)
+    # Without correspondence the displacement is that of the prior, none.
+    turn, origin, target = np.eye(3), np.zeros(3), np.zeros(3)
+    if problem.fitted.corresponding:
+        points = generic[closed.name]
+        origin, target = points.mean(axis=0), closed.vertices.mean(axis=0)
+        turn = Rotation.align_vectors(closed.vertices - target, points - origin)[0].as_matrix()
+    compared = []
+    for frame in sorted(case.frames, key=lambda f: bool(case.fitted) and f is not closed):
+        if frame.name not in generic or frame.name not in fitted:
+            continue
+        positions = {
+            "generic": generic[frame.name],
+            "registered": (generic[frame.name] - origin) @ turn.T + target,
+            "personalised": fitted[frame.name],
+        }
+        distances = {
+            model: np.asarray(np.linalg.norm(points - frame.vertices, axis=1))
+            if frame.corresponds
+            else surface_distance(frame.vertices, points, case.surface.triangles)
+            for model, points in positions.items()
+        }
+        seen = frame.role in (Role.CLOSED, Role.FITTED)
+        compared.append(FrameComparison(frame, seen, positions, distances))
+    return tuple(compared)
 
 
 def largest_difference_anew(problem: CaseProblem, estimate: CaseEstimate) -> float | None:
     """Largest distance (mm) of the fitted closed valve from one closed from the open state.
 
-    Both are on the mesh of the guide where there is one, which leads all closures of the other.
-    None if one of them does not close.
+    Both on the guide mesh if there is one. None if one of them does not close.
     """
-    closure, m = estimate.place.closure, estimate.result.estimate
+    closure, m = estimate.point.closure, estimate.result.estimate
     assert m is not None
     model = closure.model.guide or closure.model
     anew = replace(model, continuation=False, guide=None, repeat=True)

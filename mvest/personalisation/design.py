@@ -1,12 +1,11 @@
-"""What frames of a case will tell, found out before anything is estimated.
+"""Expected precision of an estimate, before anything is estimated.
 
-The information of an observation needs a model, where it is believed to be, and how well what is
-seen; it needs no observed value. `expect_case` closes the generic valve once on the coarse mesh of
-the guide and says which intervals to expect, what they rest on and what would narrow them
-(`mvest.personalisation.known`). `design_case` says how many more frames it takes: information adds
-up over frames whose errors are independent; what is not known of pressures, chordae, displacement
-and geometry is common to them. Each design is a few small matrices, and all need one set of
-closures.
+The information of an observation needs a model, its parameters and the errors, but no observed
+value. `expect_case` closes the generic valve once on the coarse guide mesh, and gives the expected
+intervals, their sources of variance and what would narrow them (`mvest.personalisation.known`).
+`design_case` compares numbers of closed frames: information adds over frames with independent
+errors, but errors of pressures, chordae, displacement and geometry are common to them. All designs
+are a few small matrices from one set of closures.
 """
 
 from __future__ import annotations
@@ -21,65 +20,60 @@ import numpy as np
 from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import ERROR, OFFSET, SCALE, is_frame_pressure
 from mvest.closure.model import ClosureModel
-from mvest.estimation.information.design import Design, together
-from mvest.estimation.information.identifiability import Identifiability
 from mvest.estimation.prediction import predict
 from mvest.estimation.transform import to_filter
-from mvest.personalisation.errors import FrameErrors, linearise
-from mvest.personalisation.estimation import CaseProblem, linearised, sampled
+from mvest.personalisation.estimation import CaseProblem, linearised
 from mvest.personalisation.known import LinearModel, narrower, variance_shares
 from mvest.personalisation.model import build_coarse, build_model
 from mvest.personalisation.result import Expected
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
 from mvest.problem.estimate import expected_intervals
+from mvest.typing import FloatArray
 
 
 def expect_case(
     case: ValveCase, settings: PersonaliseSettings, model: ClosureModel | None = None
 ) -> Expected:
-    """What an estimate of a case could tell, to first order about the generic valve.
+    """Expected precision of an estimate of a case, to first order about the generic valve.
 
     Parameters
     ----------
     case : ValveCase
     settings : PersonaliseSettings
     model : ClosureModel, optional
-        The closure of the case; by default on the mesh of the guide.
+        The closure of the case; default: on the guide mesh.
     """
     model = build_coarse(case, settings) if model is None else model
     problem = CaseProblem.of(case, settings, model=model)
-    place = problem.generic()
-    if not place.prediction.converged:
-        return Expected(reason=place.prediction.reason)
-    place = linearised(place, problem)
+    point = problem.generic()
+    if not point.prediction.converged:
+        return Expected(reason=point.prediction.reason)
+    point = linearised(point, problem)
     if case.error_samples is not None:
-        place = sampled(place)
+        point = point.sampled()
     seen = predict(
-        place.errors.observation().of(lambda _: place.prediction), place.m, derivatives=True
+        point.errors.observation().of(lambda _: point.prediction), point.m, derivatives=True
     )
     transform, prior = problem.transform, to_filter(problem.transform, problem.prior)
-    H = seen.jacobian * transform.derivative(transform.forward(place.m))
-    linear = LinearModel(problem.names, prior.covariance, H, place.errors)
+    H = seen.jacobian * transform.derivative(transform.forward(point.m))
+    linear = LinearModel(problem.names, prior.covariance, H, point.errors)
     after = np.sqrt(linear.variances())
-    unknowns = expected_intervals(problem.names, transform, place.m, prior.std, after)
-    return Expected(unknowns, variance_shares(linear), narrower(problem, linear))
+    unknowns = expected_intervals(problem.names, transform, point.m, prior.std, after)
+    return Expected(unknowns, list(variance_shares(linear)), list(narrower(problem, linear)))
 
 
 SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)
-"""Of the closed frame's pressure, under which the frames of designs are: 120 to 60 mmHg."""
-
-HALF = 0.5
-"""Of the prior's standard deviation: half the error of the generic guess."""
+"""Pressures of the frames of designs as shares of the closed frame's: 120 to 60 mmHg."""
 
 ERRORS_MMHG = (0.0, 2.0, 5.0, 10.0, 20.0)
-"""Errors of pressures that designs are compared with."""
+"""Errors of pressures that designs are compared for."""
 
 KINDS = {
     "factor": "as a factor on all",
     "offset": "as an offset of all",
     "each": "of each by itself",
 }
-"""Of errors of pressures, and what a reader calls them."""
+"""Kinds of errors of pressures, and their descriptions."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "the pressures": (SCALE, OFFSET, ERROR),
@@ -89,113 +83,104 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 """Unknowns that might be known exactly, by the first part of their names."""
 
-EXACT = 1e-9
-"""Relative error of a factor that is known; zero would take it out of what is estimated."""
-
 Errors: TypeAlias = Mapping[str, float]
-"""Standard deviation of each of `KINDS`: relative of the factor, the others in mmHg."""
+"""Standard deviation of each of `KINDS`: relative for the factor, otherwise in mmHg."""
 
 
 def errors_of(kind: str, mmhg: float, pressure_mmHg: float) -> dict[str, float]:
-    """Errors of one of `KINDS` and of no other, of a size under a pressure."""
-    relative = max(mmhg / pressure_mmHg if kind == "factor" else 0.0, EXACT)
+    """Errors of only one of `KINDS`, with a size under a pressure."""
+    relative = mmhg / pressure_mmHg if kind == "factor" else 0.0
     return {"factor": relative} | {k: mmhg * (k == kind) for k in ("offset", "each")}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameDesigns:
-    """What closed frames of one valve say together.
+    """Information of closed frames of one valve.
 
     Attributes
     ----------
     pressures_mmHg : tuple of float
-        Stated of the frames, the closed one's first.
-    frames : tuple of Design
-        What each of them says of all unknowns: those of the case, the pressures' errors in mmHg
-        (`mvest.closure.frames`) and, where it is marginalised, the geometry's.
+        Stated pressures of the frames, the closed one's first.
+    names : tuple of str, (q,)
+        The unknowns of the case, the pressures' errors in mmHg (`mvest.closure.frames`) and
+        the modes of the geometry, if it is uncertain.
+    triangles : (f, q, q)
+        Root T of the information Tᵀ T of each frame about the unknowns, relative for positive ones,
+        otherwise in their units.
     knowledge : mapping
-        Unknown but those errors -> its prior's standard deviation, relative or in its unit.
+        Unknown except for errors of pressures -> its prior standard deviation in the same terms.
     stated : mapping
-        Errors of the pressures as they are stated.
+        Errors of the pressures as stated.
     """
 
     pressures_mmHg: tuple[float, ...]
-    frames: tuple[Design, ...]
+    names: tuple[str, ...]
+    triangles: FloatArray
     knowledge: Mapping[str, float]
     stated: Errors
 
     def chosen(self, count: int) -> tuple[int, ...]:
-        """Which frames make a design of ``count``: spread evenly over the pressures."""
+        """The frames of a design of ``count``: spread evenly over the pressures."""
         if count == 1:
             return (0,)
-        return tuple(np.round(np.linspace(0, len(self.frames) - 1, count)).astype(int).tolist())
+        last = len(self.pressures_mmHg) - 1
+        return tuple(np.round(np.linspace(0, last, count)).astype(int).tolist())
 
-    def at(
+    def std(
         self, count: int, errors: Errors | None = None, known: tuple[str, ...] = ()
-    ) -> Identifiability:
-        """What ``count`` frames and the prior say together.
+    ) -> dict[str, float]:
+        """Posterior standard deviation of each unknown from ``count`` frames.
 
         Parameters
         ----------
         count : int
         errors : mapping, optional
-            Of the pressures; default as stated.
+            Of the pressures; default: as stated.
         known : tuple of str
-            Further unknowns that are taken to be known exactly, by the first part of their names.
+            Further unknowns that are known exactly, by the first part of their names.
         """
         errors, members = errors or self.stated, self.chosen(count)
-        knowledge = dict(self.knowledge)
-        for name in self.frames[0].names:
-            kind, _, number = name.partition(".")
-            if kind in known:
-                knowledge[name] = 0.0
-            elif kind == SCALE:
-                knowledge[name] = errors["factor"]
-            elif kind == OFFSET:
-                knowledge[name] = errors["offset"]
-            elif kind == ERROR:
-                knowledge[name] = errors["each"] if int(number) in members else 0.0
-        return together(*(self.frames[k] for k in members)).at(1.0, knowledge)
+        pressures = {SCALE: errors["factor"], OFFSET: errors["offset"]}
+        pressures |= {f"{ERROR}.{k}": errors["each"] for k in members}
+        prior = {**dict.fromkeys(self.names, 0.0), **self.knowledge, **pressures}
+        stds = np.array(
+            [0.0 if name.partition(".")[0] in known else prior[name] for name in self.names]
+        )
+        rows = [*(self.triangles[list(members)] * stds), np.eye(len(stds))]
+        R = np.linalg.qr(np.concatenate(rows), mode="r")
+        after = stds * np.linalg.norm(np.linalg.inv(R), axis=1)
+        return dict(zip(self.names, after.tolist(), strict=True))
 
     def left(
         self, count: int, errors: Errors | None = None, known: tuple[str, ...] = ()
     ) -> dict[str, float]:
-        """Standard deviation of each modulus as a share of the prior's; arguments as of `at`.
-
-        The generic guess has 1: it is what is left of its error.
-        """
-        bound = self.at(count, errors, known)
-        return {
-            name: float(std) / self.knowledge[name]
-            for name, std in zip(bound.names, bound.std, strict=True)
-            if name.startswith("E_f.")
-        }
+        """Standard deviation of each modulus as a share of the prior's; arguments as of `std`."""
+        std = self.std(count, errors, known)
+        return {n: std[n] / self.knowledge[n] for n in self.names if n.startswith("E_f.")}
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Tidy rows of what each design leaves of each modulus' error, ``left`` in percent of it.
+        """Tidy rows: the error ``left`` of each modulus by each design, in percent of the prior's.
 
-        The pressures' errors are of one kind and have a size in mmHg, or are as stated, with
-        nothing or one group of unknowns ``known``.
+        Errors of pressures are of one kind with a size in mmHg, or as stated, then with nothing or
+        one group of unknowns ``known``.
         """
-        closed, unknowns = (
-            self.pressures_mmHg[0],
-            {n.partition(".")[0] for n in self.frames[0].names},
-        )
+        unknowns = {n.partition(".")[0] for n in self.names}
         groups = {words: group for words, group in GROUPS.items() if unknowns & set(group)}
         designs: list[tuple[str, float, str, Errors | None, tuple[str, ...]]] = [
-            (kind, mmhg, "", errors_of(kind, mmhg, closed), ())
+            (kind, mmhg, "", errors_of(kind, mmhg, self.pressures_mmHg[0]), ())
             for kind, mmhg in product(KINDS, ERRORS_MMHG)
         ]
         designs += [
             ("stated", 0.0, words, None, group) for words, group in {"": (), **groups}.items()
         ]
-        for (kind, mmhg, words, errors, known), k in product(designs, range(len(self.frames))):
-            for modulus, share in self.left(k + 1, errors, known).items():
+        counts = range(1, 1 + len(self.pressures_mmHg))
+        for (kind, mmhg, words, errors, known), count in product(designs, counts):
+            for modulus, share in self.left(count, errors, known).items():
                 yield {
                     "errors": kind,
                     "error": mmhg,
                     "known": words,
-                    "frames": k + 1,
+                    "frames": count,
                     "modulus": modulus,
                     "left": 100.0 * share,
                 }
@@ -204,11 +189,11 @@ class FrameDesigns:
 def design_case(
     case: ValveCase, settings: PersonaliseSettings, model: ClosureModel | None = None
 ) -> FrameDesigns | str:
-    """What several closed frames of a case would tell, or why that is not known.
+    """Information of several closed frames of a case, or why it is unknown.
 
-    The frames are held and seen as the closed one, under shares of its pressure (`SHARES`): one
-    closure, and an equilibrium with its derivatives for each. Errors of which samples tell are left
-    out. Parameters are those of `expect_case`.
+    The frames have the boundary and errors of the closed one, under shares of its pressure
+    (`SHARES`). That takes one closure, and an equilibrium with its derivatives for each frame.
+    Error samples are left out. Parameters are those of `expect_case`.
     """
     model = build_model(case, settings) if model is None else model
     closed = case.frame(Role.CLOSED)
@@ -225,17 +210,16 @@ def design_case(
     ]
     case = replace(case, frames=(case.frame(Role.REFERENCE), *frames), error_samples=None)
     stated = settings.pressures or PressureErrors(0.0, 0.0)
-    # As unknowns they are differentiated by; how large they are is for the designs to say.
+    # Errors of pressures are unknowns for their derivatives; the designs set their size.
     free = [u.name for u in settings.unknowns if not u.fixed]
     differentiated = PressureErrors(1.0, 1.0) if SCALE in free else None
     problem = CaseProblem.of(case, replace(settings, pressures=differentiated), model=model)
-    registered, start = problem.stated.registered, problem.start
-    generic = registered(start)
-    if not generic.converged:
-        return generic.reason
-    errors = linearise(FrameErrors(problem.fitted), registered, start, generic.y)
+    generic = problem.generic()
+    if not generic.prediction.converged:
+        return generic.prediction.reason
+    errors = linearised(generic, problem).errors
     observation, columns = problem.fitted.observation(), errors.columns()
-    # Prior standard deviations: relative of what is positive, 1 of the geometry's modes.
+    # Prior standard deviations: relative for positive unknowns, 1 for modes of the geometry.
     knowledge = {
         u.name: u.std / (u.mean if u.is_positive else 1.0)
         for u in problem.unknowns
@@ -243,19 +227,18 @@ def design_case(
     }
     modes = [f"geometry.{k}" for k in range(sum(own.shape[1] for own in columns.values()))]
     knowledge |= dict.fromkeys(modes, 1.0)
-    H = predict(observation.of(lambda _: generic), start, derivatives=True).jacobian
-    H = np.concatenate([H, *columns.values()], axis=1)
-    at = np.array([u.mean if u.is_positive else 1.0 for u in problem.unknowns] + [1.0] * len(modes))
-    names = (*problem.names, *modes)
+    seen = predict(observation.of(lambda _: generic.prediction), generic.m, derivatives=True)
+    scale = np.array([u.mean if u.is_positive else 1.0 for u in problem.unknowns])
+    H = np.concatenate([seen.jacobian * scale, *columns.values()], axis=1)
     noise = errors.single_noise()
-    # Errors of different frames are independent: without the others' rows a frame is by itself.
+    # Errors of different frames are independent, so a frame's information is that of its rows.
     of_frame = np.repeat([int(frame.name) for frame in problem.fitted.frames], observation.sizes)
+    white = [noise.whiten(np.where(of_frame[:, None] == k, H, 0.0)) for k in range(len(frames))]
+    triangles = np.stack([np.linalg.qr(own, mode="r") for own in white])
     return FrameDesigns(
         pressures,
-        tuple(
-            Design.of(np.where(of_frame[:, None] == k, H, 0.0), noise, at, names)
-            for k in range(len(problem.fitted.frames))
-        ),
+        (*problem.names, *modes),
+        triangles,
         knowledge,
         {
             "factor": knowledge.get(SCALE, 0.0),

@@ -1,4 +1,4 @@
-"""What a personalised case shows of how far it may be believed."""
+"""Diagnostics of a personalised case, from which its verdict follows."""
 
 from __future__ import annotations
 
@@ -21,43 +21,38 @@ from mvest.problem.verdict import Found, texts
 from mvest.typing import FloatArray
 
 NEIGHBOURS = 6
-"""Of a point that was seen, as on a surface of triangles."""
+"""Of an observed point, as on a surface of triangles."""
 APPROXIMATION = 2.0
-"""Times the limit of a check of the filter (`mvest.estimation.check`) beyond which it is doubtful.
-The check is of the worst direction among all unknowns: moduli lay inside their intervals where it
+"""Doubtful from this multiple of the limit of a filter's check (`mvest.estimation.check`). The
+check covers the worst direction among all unknowns, and moduli lay inside their intervals where it
 failed by less."""
 WORSE = 1.05
-"""Distance of a held-out frame, fitted over generic, that counts as farther."""
+"""Doubtful ratio of the distances of a held-out frame from the fitted and the generic valve."""
 SAME_MM = 0.5
-"""Largest distance at which a valve that was closed anew is the same, as of the gate."""
+"""Largest distance of the same closed state, as in the gate."""
 
 
 def diagnostics_of(
     fit: Personalised, gate: bool | None = None, unlike: str = ""
 ) -> dict[str, Found]:
-    """What speaks for and against the estimate of a case; nothing of it needs the truth.
+    """Findings for and against an estimate, for `mvest.problem.verdict.judge`; without the truth.
 
     Parameters
     ----------
     fit : Personalised
     gate : bool, optional
-        Whether its valve has passed the gate, if that was tested.
+        Whether its valve passed the gate; None if untested.
     unlike : str
-        How the volume that the case is from is unlike those that detectors were trained on.
-
-    Returns
-    -------
-    dict
-        As `mvest.problem.verdict.judge` takes it.
+        How the volume of the case differs from those that detectors were trained on.
     """
-    result, filtered, found = fit.result, fit.result.filtered, implausible_values(fit.case)
+    result, filtered, strange = fit.result, fit.result.filtered, implausible_values(fit.case)
     ended = f"{result.reason} ({result.detail})" if result.detail else result.reason
     estimated = filtered is not None and result.estimate is not None
     seen: dict[str, Found] = {
         "failed": texts("" if estimated else ended or "the run gives no reason"),
         "unfinished": texts(ended) if estimated and not result.converged else (),
-        "mistakes": texts(*(str(doubt) for doubt in found if doubt.mistake)),
-        "implausible": texts(*(str(doubt) for doubt in found if not doubt.mistake)),
+        "mistakes": texts(*(str(value) for value in strange if value.mistake)),
+        "implausible": texts(*(str(value) for value in strange if not value.mistake)),
         "unlike": texts(unlike),
         "unaccounted": texts(*fit.unaccounted),
     }
@@ -68,7 +63,7 @@ def diagnostics_of(
         seen["approximation"] = texts(check.sentence if far else "")
     values = {
         "moved": fit.moved,
-        "law": fit.known.law_share,
+        "law": fit.law_share,
         "again": None if fit.confirmed_mm is None else float(fit.confirmed_mm > SAME_MM),
         "gate": None if gate is None else float(not gate),
     }
@@ -83,47 +78,48 @@ def diagnostics_of(
         alike = _alike(result.observation, filtered.standardised)
         if alike is not None:
             seen["alike"] = [(abs(alike), {"alike": alike})]
-    alone = {one.parameter: one.prior_stds for one in fit.known.data_alone}
+    alone = {one["parameter"]: one["prior_stds"] for one in fit.details.get("data_alone", ())}
     for key, sizes in (("stretch", _stretch(fit, filtered)), ("data_alone", alone)):
         if sizes:
             seen[key] = [(abs(size), {"what": what}) for what, size in sizes.items()]
-    held = [
-        (one.frame, float(np.nanmean(one.registered)), float(np.nanmean(one.personalised)))
-        for one in fit.distances
-        if not one.seen
-    ]
+    held = []
+    for one in fit.frames:
+        if not one.seen:
+            generic, fitted = (
+                float(np.nanmean(one.distances[name])) for name in ("registered", "personalised")
+            )
+            words: dict[str, object] = {"frame": one.frame.name}
+            held.append((fitted - WORSE * generic, words | {"generic": generic, "fitted": fitted}))
     if held:
-        seen["held_out"] = [
-            (fitted - WORSE * generic, {"frame": frame, "generic": generic, "fitted": fitted})
-            for frame, generic, fitted in held
-        ]
+        seen["held_out"] = held
     closed = fit.case.frame(Role.CLOSED)
     observed = free_orifice(fit.case, closed)
-    if closed.name in fit.fitted and observed is not None:
-        fitted = free_orifice(fit.case, closed, fit.fitted[closed.name])
-        if fitted is not None:
-            words = {"fitted": fitted, "observed": observed}
-            seen["closure"] = [(fitted - observed, words)]
+    for one in fit.frames:
+        if one.frame is closed and observed is not None:
+            free = free_orifice(fit.case, closed, one.positions["personalised"])
+            if free is not None:
+                seen["closure"] = [(free - observed, {"fitted": free, "observed": observed})]
     return seen
 
 
 def _stretch(fit: Personalised, filtered: Estimate) -> dict[str, float]:
-    """What was known beforehand -> by how many of its standard deviations it was moved."""
+    """Prior -> its displacement by the data in standard deviations."""
     prior, after = to_filter(filtered.transform, filtered.prior), filtered.transformed
     moved = dict(zip(filtered.names, ((after.mean - prior.mean) / prior.std).tolist(), strict=True))
     if filtered.learned is not None:
-        # Errors smaller than believed contradict nothing.
+        # Errors smaller than stated contradict nothing.
         moved |= {
             f"{q.name} of the errors": q.stretch if q.name == LENGTH else max(q.stretch, 0.0)
             for q in filtered.learned.quantities
         }
-    return moved | {f"{own.name} of the valve": own.stretch for own in fit.known.geometry}
+    shifts = fit.details.get("geometry", ())
+    return moved | {f"{own['name']} of the valve": own["stretch"] for own in shifts}
 
 
 def _alike(observation: Observed, standardised: FloatArray) -> float | None:
     """Largest covariance of neighbours in the standardised innovation, over the coordinates.
 
-    Moran's I (`moran`), in units of the variance that was believed where it is smaller than that.
+    Moran's I (`moran`), in units of the stated variance if the actual one is smaller.
     """
     plain = observation.plain if isinstance(observation, WeighedObservation) else observation
     if isinstance(plain, Observation):
@@ -142,7 +138,6 @@ def _alike(observation: Observed, standardised: FloatArray) -> float | None:
     ones = np.ones(rows.size)
     one_way = coo_matrix((ones, (rows, near[:, 1:].ravel())), shape=(len(points),) * 2)
     neighbours = csr_array(one_way.maximum(one_way.T))
-    # What is smaller than believed contradicts nothing, whatever its pattern.
     statistics = [
         moran(column, neighbours) * min(1.0, float(np.var(column))) for column in values.T
     ]

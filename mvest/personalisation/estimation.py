@@ -1,8 +1,8 @@
-"""Estimation of a case: what is estimated of it, and the steps from a generic valve to an estimate.
+"""Estimation of a case, from the generic valve to an estimate; read from `estimate_all` on.
 
-Read from `estimate_all` on. Each step takes a `Place`, a closed valve about which its errors are
-linearised, and returns another one or an estimate; no object changes. Only the closures remember
-something, where they were closed last: that saves time and changes no number.
+Each step takes a `LinearisationPoint`, a closed valve with its linearised errors, and returns
+another one or an estimate. Objects do not change, except that closures remember their last closed
+state, which saves time and changes no number.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.cases.case import ValveCase
+from mvest.cases.case import Role, ValveCase
+from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, OnIterate
@@ -23,7 +24,6 @@ from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import Prediction, of_some, predict
 from mvest.estimation.run import Filter
-from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.personalisation.errors import (
     FrameErrors,
@@ -37,34 +37,44 @@ from mvest.personalisation.joint import JointPosterior, damped_step
 from mvest.personalisation.model import (
     CaseClosure,
     build_model,
-    frames_model,
+    held_state,
     with_pressures,
 )
-from mvest.personalisation.settings import PaperSettings, PersonaliseSettings, Prior
+from mvest.personalisation.settings import STIFFENS, PersonaliseSettings, Prior
+from mvest.personalisation.sources import ClosedValve
 from mvest.problem.estimate import Observed, Problem, StudyResult, estimate
 from mvest.problem.registration import REGISTRATION
 from mvest.typing import FloatArray
 
 ROUGH = 0.05
-"""Relative tolerance of an estimate about which the geometry is linearised."""
+"""Relative tolerance of an estimate that serves as linearisation point."""
 
 LEARNED = 4
-"""Iterates at which errors are learned beside those of the geometry, from an estimate without."""
+"""Iterates in which errors are learned, if the start is an estimate without errors of geometry."""
 
 SETTLED = 0.25
-"""Standard deviations of a modulus within which an estimate is where the geometry is linearised."""
+"""Distance of the moduli from the linearisation point, in standard deviations, that is enough."""
 
 OnStep = Callable[[float, int], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
-    """Moduli and geometry at which a valve was closed, and about which errors are linearised."""
+class LinearisationPoint:
+    """A closed valve, with its parameters ``m (p,)``, prediction and linearised errors."""
 
     closure: CaseClosure
     errors: FrameErrors
     m: FloatArray
     prediction: Prediction
+
+    @property
+    def valve(self) -> ClosedValve:
+        """The valve for `linearise`."""
+        return ClosedValve(self.closure.registered, self.m, self.prediction.y)
+
+    def sampled(self) -> LinearisationPoint:
+        """The point with the effect of the error samples of its case."""
+        return replace(self, errors=with_samples(self.errors, self.valve))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,29 +84,24 @@ class CaseEstimate:
     Attributes
     ----------
     result : StudyResult
-    place : Place
-        About which the last estimate is linearised.
+    point : LinearisationPoint
+        Of the last estimate.
     moved : float or None
-        Standard deviations of a modulus, at most, by which the estimate is away from there; None
-        where the geometry was linearised about what was seen alone.
+        Largest distance of a modulus from there in standard deviations; None if the geometry was
+        linearised about the measured one only.
     unaccounted : tuple of str
         Why some errors of geometry or law are not in the intervals.
     """
 
     result: StudyResult
-    place: Place
+    point: LinearisationPoint
     moved: float | None = None
     unaccounted: tuple[str, ...] = ()
-
-    @property
-    def errors(self) -> FrameErrors:
-        """Errors beside the unknowns."""
-        return self.place.errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseProblem:
-    """What is estimated of a case.
+    """The estimation problem of a case.
 
     Attributes
     ----------
@@ -104,7 +109,7 @@ class CaseProblem:
     settings : PersonaliseSettings
         With the errors of the pressures of several frames among the unknowns.
     unknowns : tuple of Prior, (p,)
-        Those that are estimated: those of the closure in its order, then the displacement.
+        The estimated ones: those of the closure in its order, then the displacement.
     prior : Gaussian
         Of these.
     transform : Log
@@ -133,23 +138,22 @@ class CaseProblem:
         on_iterate: OnIterate | None = None,
         model: ClosureModel | None = None,
     ) -> CaseProblem:
-        """The estimation of a case.
+        """The problem of a case.
 
         Parameters
         ----------
         case : ValveCase
         settings : PersonaliseSettings
-        store : Path, optional
-            Where an unstructured mesh and closed states are kept.
-        on_step, on_iterate : callable, optional
-            See `personalise`.
+        store, on_step, on_iterate
+            As of `personalise`.
         model : ClosureModel, optional
-            As `build_model` makes it; one that has closed already need not do so again.
+            From `build_model`, possibly closed already.
 
         Raises
         ------
         InputError
-            If an unknown is not one of the case's, or error samples meet several fitted frames.
+            If the case lacks an unknown, has error samples and several fitted frames, or errors of
+            pressures are unknown but their common factor is not.
         """
         settings = with_pressures(case, settings)
         if case.fitted and case.error_samples is not None:
@@ -161,128 +165,114 @@ class CaseProblem:
             model = build_model(case, settings, store)
             model.on_step = on_step
         free = [u for u in settings.unknowns if not u.fixed]
-        own = [u for u in free if u.name not in REGISTRATION]
-        unknowns = (*own, *(u for u in free if u.name in REGISTRATION))
+        unknowns = tuple(sorted(free, key=lambda u: u.name in REGISTRATION))
         prior = Gaussian.from_variance(
             np.array([u.mean for u in unknowns]), np.array([u.std for u in unknowns]) ** 2
         )
         transform = Log(tuple(u.is_positive for u in unknowns))
-        # Not the prior's mean, which may differ from where filters start by its last bit.
+        # Filters start here; the last bit may differ from the prior's mean.
         start = transform.inverse(transform.forward(prior.mean))
-        several = frames_model(case, settings, model)
-        names = tuple(u.name for u in unknowns)
-        stated = CaseClosure.of(model, several, names, start)
-        shown = None if several is None else several.frames
-        fitted = FittedFrames(case, settings, model.valve, shown)
+        several = None
+        if case.fitted:
+            closed = case.frame(Role.CLOSED)
+            ordered = sorted(case.fitted, key=lambda f: abs(f.pressure_mmHg - closed.pressure_mmHg))
+            states = {frame.name: held_state(model, frame) for frame in ordered}
+            errors = tuple(u.name for u in settings.unknowns if is_frame_pressure(u.name))
+            several = FramesModel(model, closed.name, states, closed.pressure_mmHg, errors)
+        stated = CaseClosure.of(model, several, tuple(u.name for u in unknowns), start)
+        names = None if several is None else several.frames
+        fitted = FittedFrames(case, settings, model.valve, names)
         return cls(case, settings, unknowns, prior, transform, fitted, stated, on_iterate)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the unknowns that are estimated, ``(p,)``."""
+        """Of the estimated unknowns, ``(p,)``."""
         return tuple(u.name for u in self.unknowns)
-
-    @property
-    def start(self) -> FloatArray:
-        """Values ``(p,)`` of the generic valve, at which every estimation begins."""
-        return self.stated.shared.start
 
     @property
     def moduli(self) -> list[int]:
         """Which unknowns are moduli."""
         return [k for k, u in enumerate(self.unknowns) if u.is_modulus]
 
-    def generic(self) -> Place:
-        """The generic valve, with the errors that are known before it is closed."""
-        prediction = self.stated.shared(self.start)
-        return Place(self.stated, FrameErrors(self.fitted), self.start, prediction)
+    def generic(self) -> LinearisationPoint:
+        """The generic valve, where every estimation starts; nothing is linearised yet."""
+        start = self.stated.shared.start
+        prediction = self.stated.shared(start)
+        return LinearisationPoint(self.stated, FrameErrors(self.fitted), start, prediction)
 
-    def filter(
-        self, tolerance: float, start: FloatArray | None = None, *, final: bool = True
-    ) -> IteratedFilter:
-        """The filter of all unknowns, to a relative tolerance, from ``start (p,)`` if given.
+    def filter(self, tolerance: float) -> IteratedFilter:
+        """The filter of all unknowns, to a relative tolerance."""
+        return IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
 
-        ``final``: something is read from its covariance, which is to be that of the posterior.
-        """
-        plain = IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
-        if start is None:
-            return plain
-        return replace(plain, start=tuple(start.tolist()), max_learned=LEARNED, second_order=final)
-
-    def problem(self, closure: CaseClosure, filter_: Filter) -> Problem:
-        """The estimation of all unknowns, without its observation."""
-        return Problem(
-            self.names,
-            closure.shared,
-            self.prior,
-            filter_,
-            self.transform,
-            self.settings.mechanics.tissue,
-        )
-
-    def estimate(self, place: Place, filter_: Filter, observation: Observed) -> StudyResult:
-        """All unknowns by one run of a filter, with the closure and the errors of a place."""
-        result = estimate(
-            self.problem(place.closure, filter_), observation, on_iterate=self.on_iterate
-        )
-        return self._widened(result, observation, place.errors)
-
-    def estimate_moduli(
-        self,
-        place: Place,
-        filter_: Filter,
-        observation: Observed,
-        *,
-        log: bool,
-        variance: float | None = None,
+    def estimate(
+        self, point: LinearisationPoint, filter_: Filter, observation: Observed
     ) -> StudyResult:
-        """The moduli alone, everything else at its prior mean, and no tissue that stiffens."""
-        moduli, shared = np.array(self.moduli), place.closure.shared
-        stiffens = [u.name.startswith("stiffening.") for u in self.unknowns]
+        """All unknowns by one run of a filter, with the closure and the errors of a point."""
+        return self._estimated(
+            point,
+            Problem(
+                self.names,
+                point.closure.shared,
+                self.prior,
+                filter_,
+                self.transform,
+                self.settings.mechanics.tissue,
+            ),
+            observation,
+        )
+
+    def alternatives(self, point: LinearisationPoint) -> dict[str, StudyResult]:
+        """The moduli alone: all else at its prior mean, with geometry and law known exactly.
+
+        ``moduli_only`` and ``paper`` (by the paper's filter with its independent R), as the
+        settings request. Tissue does not stiffen.
+        """
+        settings, moduli, shared = self.settings, np.array(self.moduli), point.closure.shared
+        found: dict[str, StudyResult] = {}
+        stiffens = [u.name.startswith(STIFFENS) for u in self.unknowns]
         known = np.where(stiffens, 0.0, shared.start)
         prior = Gaussian(self.prior.mean[moduli], self.prior.covariance[np.ix_(moduli, moduli)])
-        if variance is not None:
-            prior = Gaussian.from_variance(prior.mean, variance)
-        problem = Problem(
+        plain = Problem(
             tuple(self.names[k] for k in moduli),
             of_some(shared, known, moduli, snap=1e-14),
             prior,
-            filter_,
-            Log() if log else Log((False,) * len(moduli)),
-            self.settings.mechanics.tissue,
+            self.filter(settings.tolerance),
+            Log(),
+            settings.mechanics.tissue,
         )
-        result = estimate(problem, observation, on_iterate=self.on_iterate)
-        return self._widened(result, observation, place.errors)
+        if settings.moduli_only:
+            found["moduli_only"] = self._estimated(point, plain, point.errors.observation())
+        if (paper := settings.paper) is not None:
+            own = replace(
+                plain,
+                prior=Gaussian.from_variance(prior.mean, paper.P0),
+                filter=PaperFilter(paper.Q, max_iterations=paper.max_iterations),
+                transform=Log((False,) * len(moduli)),
+            )
+            found["paper"] = self._estimated(point, own, self.fitted.as_in_paper(paper))
+        return found
 
-    def estimate_as_paper(self, place: Place, paper: PaperSettings) -> StudyResult:
-        """The moduli alone, with the paper's filter and its independent R."""
-        filter_ = PaperFilter(paper.Q, max_iterations=paper.max_iterations)
-        observation = self.fitted.as_in_paper(paper)
-        return self.estimate_moduli(place, filter_, observation, log=False, variance=paper.P0)
-
-    def _widened(
-        self, result: StudyResult, observation: Observed, errors: FrameErrors
+    def _estimated(
+        self, point: LinearisationPoint, problem: Problem, observation: Observed
     ) -> StudyResult:
-        """The result with the covariance that the error samples give it, if there are any."""
-        filtered = result.filtered
-        weighed = errors.samples is not None and isinstance(observation, WeighedObservation)
+        """An estimate, with the covariance from the error samples if its noise includes them."""
+        result = estimate(problem, observation, on_iterate=self.on_iterate)
+        filtered, samples = result.filtered, point.errors.samples
+        weighed = samples is not None and isinstance(observation, WeighedObservation)
         if not weighed or filtered is None or filtered.prediction is None:
             return result
+        assert samples is not None
+        learned = filtered.learned
+        if learned is not None:
+            samples = point.errors.weighing(samples, learned)
+        prior = to_filter(filtered.transform, filtered.prior)
+        posterior = samples.posterior(slopes(filtered), prior.covariance, filtered.curvature)
         covariances = np.array(filtered.transformed_iterate_covariances)
-        covariances[-1] = sampled_posterior(filtered, errors).covariance
+        covariances[-1] = posterior.covariance
+        if learned is not None:
+            covariances[-1] += learned.covariance
         widened = replace(filtered, transformed_iterate_covariances=covariances)
         return replace(result, filtered=widened)
-
-
-def sampled_posterior(filtered: Estimate, errors: FrameErrors) -> SampledPosterior:
-    """Covariance of an estimate in filter coordinates, from the error samples."""
-    samples, learned = errors.samples, filtered.learned
-    assert samples is not None
-    prior = to_filter(filtered.transform, filtered.prior)
-    H = slopes(filtered)
-    if learned is None:
-        return samples.posterior(H, prior.covariance, filtered.curvature)
-    posterior = errors.weighing(samples, learned).posterior(H, prior.covariance, filtered.curvature)
-    return replace(posterior, covariance=posterior.covariance + learned.covariance)
 
 
 def slopes(filtered: Estimate) -> FloatArray:
@@ -292,177 +282,163 @@ def slopes(filtered: Estimate) -> FloatArray:
     return np.asarray(filtered.prediction.jacobian * filtered.transform.derivative(z))
 
 
-def estimate_all(problem: CaseProblem, generic: Place) -> CaseEstimate:
-    """All unknowns, with the errors of geometry and law about an estimate without them.
+def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstimate:
+    """Estimate all unknowns, with the errors of geometry and law.
 
-    What these errors do depends on the moduli: with a modulus half as large the derivatives are off
-    by a quarter. So all unknowns are estimated without them first, roughly.
+    The effects of these errors depend on the moduli: at half the modulus, derivatives are off by a
+    quarter. So a rough estimate without them gives the first linearisation point.
 
     Parameters
     ----------
     problem : CaseProblem
-    generic : Place
-        With what error samples do, if the case has any.
+    generic : LinearisationPoint
+        With the effect of error samples, if the case has any.
     """
     settings = problem.settings
     if settings.nuisance_geometry is None and not settings.nuisance_law:
         plain = problem.filter(settings.tolerance)
-        result = problem.estimate(generic, plain, generic.errors.observation())
-        return CaseEstimate(result, generic)
+        return CaseEstimate(problem.estimate(generic, plain, generic.errors.observation()), generic)
     began = time.perf_counter()
-    rough = problem.estimate(
-        generic,
-        problem.filter(max(ROUGH, settings.tolerance)),
-        generic.errors.rough_observation(),
-    )
-    at = problem.start if rough.estimate is None else rough.estimate
+    filter_ = problem.filter(max(ROUGH, settings.tolerance))
+    rough = problem.estimate(generic, filter_, generic.errors.rough_observation())
+    at = generic.m if rough.estimate is None else rough.estimate
     prediction = generic.closure.shared(at)
     if not prediction.converged:
         return CaseEstimate(rough, generic, unaccounted=(prediction.reason,))
-    place = linearised(
-        replace(generic, errors=FrameErrors(problem.fitted), m=at, prediction=prediction), problem
-    )
-    moved, unaccounted, seen = None, place.errors.unaccounted, place
+    plain_errors = FrameErrors(problem.fitted)
+    point = linearised(LinearisationPoint(generic.closure, plain_errors, at, prediction), problem)
+    moved, unaccounted, first = None, point.errors.unaccounted, point
     if problem.case.error_samples is not None:
-        # They say what is likely of the geometry; nothing is expected of it.
-        place = sampled(place)
-    elif place.errors.geometry:
-        place, moved, more = _expected(problem, place)
-        unaccounted = place.errors.unaccounted + more
-    result = _estimate_about(problem, place)
-    if not result.converged and place.errors.displaced_by:
-        reason = f"about the geometry that is expected: {result.reason} ({result.detail})"
-        place, moved, unaccounted = seen, None, (*seen.errors.unaccounted, reason)
-        result = _estimate_about(problem, place)
+        # The samples describe the geometry, so it has no other posterior mean.
+        point = point.sampled()
+    elif point.errors.geometry:
+        point, moved, more = _relinearised(problem, point)
+        unaccounted = point.errors.unaccounted + more
+    result = _estimate_about(problem, point)
+    if not result.converged and point.errors.displaced_by:
+        reason = f"about the expected geometry: {result.reason} ({result.detail})"
+        point, moved, unaccounted = first, None, (*first.errors.unaccounted, reason)
+        result = _estimate_about(problem, point)
     result = replace(result, seconds=time.perf_counter() - began)
-    return CaseEstimate(result, place, moved, unaccounted)
+    return CaseEstimate(result, point, moved, unaccounted)
 
 
-def linearised(place: Place, problem: CaseProblem) -> Place:
-    """A place with its errors of geometry and law."""
-    seen = problem.stated.model if place.errors.displaced_by else None
-    errors = linearise(place.errors, place.closure.registered, place.m, place.prediction.y, seen)
-    return replace(place, errors=errors)
+def linearised(point: LinearisationPoint, problem: CaseProblem) -> LinearisationPoint:
+    """The point with its errors of geometry and law."""
+    seen = problem.stated.model if point.errors.displaced_by else None
+    return replace(point, errors=linearise(point.errors, point.valve, seen))
 
 
-def sampled(place: Place) -> Place:
-    """A place with what the error samples of its case do."""
-    errors = with_samples(place.errors, place.closure.registered, place.m, place.prediction.y)
-    return replace(place, errors=errors)
-
-
-def _estimate_about(problem: CaseProblem, place: Place, *, final: bool = True) -> StudyResult:
-    """All unknowns from ``place`` on, where closure and errors are linearised."""
+def _estimate_about(
+    problem: CaseProblem, point: LinearisationPoint, *, final: bool = True
+) -> StudyResult:
+    """Estimate all unknowns, starting at ``point``; the covariance is exact only if ``final``."""
     tolerance = problem.settings.tolerance
-    filter_ = problem.filter(tolerance if final else max(ROUGH, tolerance), place.m, final=final)
-    return problem.estimate(place, filter_, place.errors.observation())
+    filter_ = replace(
+        problem.filter(tolerance if final else max(ROUGH, tolerance)),
+        start=tuple(point.m.tolist()),
+        max_learned=LEARNED,
+        second_order=final,
+    )
+    return problem.estimate(point, filter_, point.errors.observation())
 
 
-def _expected(problem: CaseProblem, place: Place) -> tuple[Place, float | None, tuple[str, ...]]:
-    """Where estimate and geometry are expected, how far the estimate is from there, and doubts.
+def _relinearised(
+    problem: CaseProblem, point: LinearisationPoint
+) -> tuple[LinearisationPoint, float | None, tuple[str, ...]]:
+    """The joint mode of parameters and geometry, by Gauss-Newton steps from ``point``.
 
-    Steps of Gauss and Newton for parameters and geometry together: the closure is that of a
-    displaced valve, and the prior of the geometry's errors stays about what was seen.
+    Each step displaces the geometry of the closure; the prior of its errors stays about the
+    measured one. Also the distance of the moduli from there (`CaseEstimate.moved`), and why
+    the steps ended early.
     """
-    considered = problem.settings.nuisance_geometry
-    assert considered is not None
-    result, moved = None, None
-    for _ in range(considered.renewals):
-        before = result or _estimate_about(problem, place, final=False)
-        found = _nearer(problem, before, place)
-        if found is place:
-            return place, _step(problem, before, place), ()
-        renewed = found if isinstance(found, str) else _renewed(problem, found)
-        if isinstance(renewed, str):
-            return place, moved, (f"about the geometry that is expected: {renewed}",)
-        place, result = renewed
-        moved = _step(problem, result, place)
+    nuisance = problem.settings.nuisance_geometry
+    assert nuisance is not None
+    result, moved, why = None, None, ""
+    for _ in range(nuisance.renewals):
+        before = result or _estimate_about(problem, point, final=False)
+        found = _nearer(problem, before, point)
+        if found is point:
+            return point, _distance(problem, before, point), ()
+        if isinstance(found, str):
+            why = found
+            break
+        found = linearised(found, problem)
+        if not found.errors.geometry:
+            why = "; ".join(found.errors.unaccounted)
+            break
+        trial = _estimate_about(problem, found, final=False)
+        if not trial.converged:
+            why = f"{trial.reason} ({trial.detail})"
+            break
+        point, result = found, trial
+        moved = _distance(problem, result, point)
         if moved < SETTLED:
             break
-    return place, moved, ()
+    return point, moved, (f"about the expected geometry: {why}",) if why else ()
 
 
-def _step(problem: CaseProblem, result: StudyResult, place: Place) -> float:
-    """Standard deviations of a modulus, at most, from a place to the estimate about it."""
+def _distance(problem: CaseProblem, result: StudyResult, point: LinearisationPoint) -> float:
+    """Largest distance of an estimated modulus from a point, in standard deviations."""
     assert result.filtered is not None
-    found, z = result.filtered.transformed, problem.transform.forward(place.m)
+    found, z = result.filtered.transformed, problem.transform.forward(point.m)
     moduli = problem.moduli
     return float(np.max(np.abs(found.mean - z)[moduli] / found.std[moduli]))
 
 
-def _renewed(problem: CaseProblem, place: Place) -> tuple[Place, StudyResult] | str:
-    """A place with its errors and a rough estimate about it, or why there is none."""
-    place = linearised(place, problem)
-    if not place.errors.geometry:
-        return "; ".join(place.errors.unaccounted)
-    result = _estimate_about(problem, place, final=False)
-    return (place, result) if result.converged else f"{result.reason} ({result.detail})"
+def _nearer(
+    problem: CaseProblem, result: StudyResult, point: LinearisationPoint
+) -> LinearisationPoint | str:
+    """A more probable point towards the estimate and its expected geometry, or why there is none.
 
-
-def _nearer(problem: CaseProblem, result: StudyResult, place: Place) -> Place | str:
-    """Where estimate and expected geometry are more probable than at ``place``, or why nowhere.
-
-    On the way from ``place`` to them (`damped_step`); ``place`` itself, if it is as good.
+    ``point`` itself if it is as good.
     """
-    filtered, observation = result.filtered, result.observation
-    posterior = joint(problem, result, place.errors)
-    if posterior is None or observation is None:
+    filtered, residual = result.filtered, result.residual
+    posterior = joint(problem, result, point.errors)
+    if posterior is None or filtered is None or residual is None:
         return result.reason
-    assert filtered is not None
-    assert filtered.prediction is not None
-
-    def improbability(there: Place) -> float:
-        return posterior.improbability_of(there.m, there.prediction, there.errors.displaced_by)
-
-    z = filtered.transformed.mean
-    H = filtered.prediction.jacobian * problem.transform.derivative(z)
-    end, residual = posterior.stepped(z, observation.y - filtered.prediction.y, H)
+    z, H = filtered.transformed.mean, slopes(filtered)
+    # A filter stops before its last small step; this step takes it.
+    end = posterior.step(z, residual, H)
+    residual = residual - H @ (end - z)
     modes = posterior.expected(residual)
-    begin = problem.transform.forward(place.m)
-    was = place.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
-    here = improbability(place)
-    offset = place.errors.offset(modes)
-    promised = here - posterior.improbability(end, residual - offset, modes)
+    begin = problem.transform.forward(point.m)
+    was = point.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
+    here = posterior.misfit_at(point.m, point.prediction, point.errors.displaced_by)
+    offset = point.errors.offset(modes)
+    predicted = here - posterior.misfit(end, residual - offset, modes)
 
-    def trial(share: float) -> tuple[float, Place] | str:
-        there = _displaced(
+    def trial(share: float) -> tuple[float, LinearisationPoint] | str:
+        return _displaced(
             problem,
             tuple(a + share * (b - a) for a, b in zip(was, modes, strict=True)),
             problem.transform.inverse(begin + share * (end - begin)),
             posterior,
         )
-        return there if isinstance(there, str) else (improbability(there), there)
 
-    found = damped_step(trial, here, promised)
-    if found == "" and promised < SETTLED**2:
-        # To first order a gain is the square of a distance in standard deviations.
-        return place
-    return found or "no step to it makes what was seen more probable"
+    found = damped_step(trial, here, predicted)
+    if found == "" and predicted < SETTLED**2:
+        # To first order the gain is the squared distance in standard deviations.
+        return point
+    return found or "no step towards it fits the observation better"
 
 
 def joint(problem: CaseProblem, result: StudyResult, errors: FrameErrors) -> JointPosterior | None:
-    """Of the parameters and the geometry, to first order about an estimate made with errors.
-
-    None without an estimate, or where nothing of the geometry is in doubt.
-    """
+    """Of parameters and geometry about an estimate; None without either."""
     filtered = result.filtered
     if filtered is None or filtered.prediction is None or not errors.geometry:
         return None
-    return JointPosterior(
-        to_filter(problem.transform, problem.prior),
-        problem.transform,
-        problem.fitted.observation(),
-        errors,
-        filtered.learned,
-    )
+    prior = to_filter(problem.transform, problem.prior)
+    observation = problem.fitted.observation()
+    return JointPosterior(prior, problem.transform, observation, errors, filtered.learned)
 
 
 def _displaced(
     problem: CaseProblem, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior
-) -> Place | str:
-    """The valve with a geometry displaced by modes, or why it does not close.
+) -> tuple[float, LinearisationPoint] | str:
+    """Misfit and point of the valve displaced by modes, or why it does not close.
 
-    It is closed at ``m (p,)``, and from there with what fits best to this geometry.
+    It is closed at ``m (p,)``, then with the best parameters for this geometry.
     """
     kinds = [source.modes for source in posterior.errors.geometry if source.modes is not None]
     try:
@@ -475,7 +451,9 @@ def _displaced(
     errors = posterior.errors.displaced(modes)
     better = posterior.refitted(m, first)
     again = predict(closure.shared, better)
-    found = [Place(closure, errors, m, first)]
-    if again.converged:
-        found.append(Place(closure, errors, better, again))
-    return min(found, key=lambda one: posterior.improbability_of(one.m, one.prediction, modes))
+    tried = [(m, first), (better, again)] if again.converged else [(m, first)]
+    found = [
+        (posterior.misfit_at(at, y, modes), LinearisationPoint(closure, errors, at, y))
+        for at, y in tried
+    ]
+    return min(found, key=lambda one: one[0])

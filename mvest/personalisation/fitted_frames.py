@@ -1,7 +1,7 @@
-"""The frames that are fitted, and how a prediction is compared with them.
+"""The fitted frames and their comparison with a prediction.
 
-Where vertices are known again they are compared one by one; elsewhere the points of a frame with
-the predicted surface, which is drawn finer and smoothed.
+Corresponding vertices are compared one by one. Otherwise the points of a frame are compared with
+the predicted surface, refined and smoothed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mvest.observation.surfaces import (
 )
 from mvest.observation.vertices import Observation
 from mvest.personalisation.settings import PaperSettings, PersonaliseSettings
-from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.typing import BoolArray, IntArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.triangles import directed_edges
 
@@ -29,34 +29,34 @@ BORDER = 3.0
 """Standard deviations from the border of the leaflets within which points are not compared."""
 
 MAX_VERTICES = 2000
-"""Vertices of a frame that are compared: more, nearer to each other than errors are alike, say
-nothing new, and their correlation is factorised."""
+"""Compared vertices of a frame. More are closer than the correlation length of their errors, so
+they add nothing, and their correlation matrix is factorised."""
 
 DRAWN, WIDTH = 0.3, 0.5
-"""mm, edges of the predicted surface that points are compared with, and over which it is smoothed.
-Facets as they are predicted are up to 0.1 mm off where leaflets bend, and their normals jump."""
+"""mm, edge length and smoothing width of the predicted surface that points are compared with. The
+predicted facets are up to 0.1 mm off where leaflets bend, and their normals jump."""
 
 BLUR, BLURRED_MM = 1.5, 0.5
-"""Width for a first estimate, and standard deviation below which no point is then believed (mm): a
-leaflet that is some millimetres away attracts smoothly, and what is beside it does not."""
+"""mm, smoothing width of a first estimate, and its least standard deviation of a point. A leaflet
+that is some millimetres away then attracts smoothly, and its neighbours do not."""
 
 SURFACE_MM = 0.1
-"""mm, standard deviation below which no single point of a surface is believed where vertices do not
-correspond: between them both surfaces are only drawn."""
+"""mm, least standard deviation of a point of a surface without correspondence, since both surfaces
+are interpolated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedFrames:
-    """The frames of a case that are fitted.
+    """The fitted frames of a case.
 
     Attributes
     ----------
     case : ValveCase
     settings : PersonaliseSettings
     valve : Valve
-        Whose closure is predicted.
-    several : tuple of str, optional
-        Names of several fitted frames in the order in which they are predicted, the closed last.
+        Of the closure.
+    several : tuple of str or None
+        Names of several fitted frames in the order of prediction, the closed frame last.
     """
 
     case: ValveCase
@@ -66,7 +66,7 @@ class FittedFrames:
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """The frames, in the order in which they are predicted, the closed last."""
+        """The frames in the order of prediction, the closed frame last."""
         if self.several is None:
             return (self.case.frame(Role.CLOSED),)
         by_name = {frame.name: frame for frame in self.case.frames}
@@ -75,96 +75,77 @@ class FittedFrames:
     @property
     def corresponding(self) -> bool:
         """Whether vertices are compared one by one."""
-        return self.settings.correspondence and all(one.corresponds for one in self.frames)
+        return all(one.corresponds for one in self.frames)
 
-    def length(self, *, stated: bool = False) -> float:
-        """Over how many mm errors are alike: as the case states, always so if ``stated``.
+    @property
+    def length(self) -> float:
+        """Correlation length of errors in mm: as stated, or 0 besides error samples.
 
-        Where samples tell how errors are alike, what is beside them is taken for independent. Were
-        it smooth too, the filter would trust the finest detail of a closed leaflet most, which no
-        mesh and no image have right: moduli of two simulated patients then came out two to four
+        With a smooth remainder the filter would trust the finest detail of a closed leaflet most,
+        which neither mesh nor image resolves: moduli of two simulated patients came out two to four
         times too high, and the fitted valve farther from the frame than the generic one.
         """
-        sampled = self.case.error_samples is not None and not stated
+        sampled = self.case.error_samples is not None
         return 0.0 if sampled else self.case.uncertainty.correlation_length_mm
 
-    def observation(self, *, stated: bool = False) -> Observation | SurfaceObservation:
-        """The frames that are fitted, with the uncertainty of single observations.
+    def observation(self) -> Observation | SurfaceObservation:
+        """The fitted frames with the stated uncertainty, independent if it is to be learned.
 
-        That is what the case states (see `length`); independent where it is to be learned.
+        Without correspondence all points have the typical one.
         """
         uncertainty = self.case.uncertainty
         std = uncertainty.typical_mm
-        learned = self.settings.errors is not None
-        length = 0.0 if learned else self.length(stated=stated)
-        scale = uncertainty.std_mm / std if isinstance(uncertainty.std_mm, np.ndarray) else None
+        length = 0.0 if self.settings.errors is not None else self.length
         names = self.several or ("closed",)
         predicted = ("open", *names)
-        if self.corresponding:
-            correlation = (
-                SpatialCorrelation(self.case.surface.vertices, length) if length > 0 else None
-            )
-            kept = _thinned(len(self.frames[-1].vertices))[:, None]
-            seen = np.stack([np.where(kept, frame.vertices, np.nan) for frame in self.frames])
-            return Observation(names, seen, np.array(std**2), correlation, scale, predicted)
-        points = tuple(
-            self._points(name, frame, scale) for name, frame in zip(names, self.frames, strict=True)
-        )
-        return SurfaceObservation(points, self._surface(DRAWN, WIDTH), std, length, predicted)
+        if not self.corresponding:
+            frames = zip(names, self.frames, strict=True)
+            points = tuple(self._points(name, frame) for name, frame in frames)
+            surface = PredictedSurface.of_valve(self.valve, DRAWN, WIDTH)
+            return SurfaceObservation(points, surface, std, length, predicted)
+        scale = uncertainty.std_mm / std if isinstance(uncertainty.std_mm, np.ndarray) else None
+        correlation = SpatialCorrelation(self.case.surface.vertices, length) if length > 0 else None
+        some = _thinned(len(self.frames[-1].vertices))[:, None]
+        seen = np.stack([np.where(some, frame.vertices, np.nan) for frame in self.frames])
+        return Observation(names, seen, np.array(std**2), correlation, scale, predicted)
 
     def blurred(self) -> SurfaceObservation:
-        """Surfaces that are seen through a blur; see `BLUR`."""
+        """Surfaces blurred for a first estimate; see `BLUR`."""
         plain = self.observation()
         assert isinstance(plain, SurfaceObservation)
-        return replace(plain, surface=self._surface(0.5 * BLUR, BLUR))
+        return replace(plain, surface=PredictedSurface.of_valve(self.valve, 0.5 * BLUR, BLUR))
 
     def as_in_paper(self, paper: PaperSettings) -> Observation | SurfaceObservation:
         """All of the frames, with the paper's independent R."""
         seen = self.observation()
         if isinstance(seen, Observation):
-            return replace(
-                seen,
-                positions=np.stack([frame.vertices for frame in self.frames]),
-                variance=np.array(paper.R),
-                correlation=None,
-                scale=None,
-            )
-        std = float(np.sqrt(paper.R))
-        return replace(
-            seen,
-            seen=tuple(replace(each, scale=None) for each in seen.seen),
-            std_mm=std,
-            correlation_length_mm=0.0,
-        )
+            positions = np.stack([frame.vertices for frame in self.frames])
+            R = np.array(paper.R)
+            return replace(seen, positions=positions, variance=R, correlation=None, scale=None)
+        return replace(seen, std_mm=float(np.sqrt(paper.R)), correlation_length_mm=0.0)
 
-    def _surface(self, edge: float, width: float) -> PredictedSurface:
-        """The predicted surface that points are compared with; see `PredictedSurface`."""
-        return PredictedSurface.of_valve(self.valve, edge, width)
-
-    def _points(self, name: str, frame: Frame, scale: FloatArray | None) -> ObservedSurface:
-        """What is compared of a frame whose vertices are not known again."""
+    def _points(self, name: str, frame: Frame) -> ObservedSurface:
+        """The compared points of a frame without correspondence."""
         uncertainty, region = self.case.uncertainty, _vertex_region(frame)
-        border, kept = BORDER * uncertainty.typical_mm, _thinned(len(frame.vertices))
-        points = ObservedSurface(
-            name,
-            frame.vertices[kept],
-            region[kept],
-            frame.free_edge,
-            scale=None if scale is None else scale[kept],
-        )
-        far = 1.0 if points.scale is None else points.scale
-        alike = self.settings.errors is not None or uncertainty.correlation_length_mm > 0
-        if alike:
-            # Beyond its border the surface goes on, but where it bends not as it does here.
-            points = points.beyond(_rim(frame), frame.vertices, border * far)
-        return replace(points, free_edge_region=_edge_region(frame, region, border))
+        border, some = BORDER * uncertainty.typical_mm, _thinned(len(frame.vertices))
+        points = ObservedSurface(name, frame.vertices[some], region[some], frame.free_edge)
+        if self.settings.errors is not None or uncertainty.correlation_length_mm > 0:
+            # Beyond its border the surface is extended, but does not bend as the leaflet does.
+            edges = np.sort(directed_edges(frame.triangles), axis=1)
+            once, count = np.unique(edges, axis=0, return_counts=True)
+            rim = np.asarray(once[count == 1][:, [0, 1, 1]])  # triangles without area
+            points = points.beyond(rim, frame.vertices, border)
+        # Near the line between two leaflets the free edge may belong to either.
+        own = region[cKDTree(frame.vertices).query(frame.free_edge)[1]]
+        between = cKDTree(frame.vertices[region == UNKNOWN]).query(frame.free_edge)[0]
+        return replace(points, free_edge_region=np.where(between < border, UNKNOWN, own))
 
 
 def _thinned(n: int) -> BoolArray:
-    """Which of n vertices are compared: all, or evenly spread ones if there are very many."""
-    kept = np.zeros(n, dtype=np.bool_)
-    kept[:: -(-n // MAX_VERTICES)] = True
-    return kept
+    """Which of n vertices are compared: all, or an even selection of very many."""
+    some = np.zeros(n, dtype=np.bool_)
+    some[:: -(-n // MAX_VERTICES)] = True
+    return some
 
 
 def _vertex_region(frame: Frame) -> IntArray:
@@ -174,20 +155,3 @@ def _vertex_region(frame: Frame) -> IntArray:
     np.minimum.at(low, frame.triangles.ravel(), np.repeat(frame.region, 3))
     np.maximum.at(high, frame.triangles.ravel(), np.repeat(frame.region, 3))
     return np.where(low == high, low, UNKNOWN)
-
-
-def _edge_region(frame: Frame, region: IntArray, border: float) -> IntArray:
-    """The leaflet of each point of the free edge ``(j,)``, ``UNKNOWN`` near to where two meet.
-
-    ``border`` is how near, in mm, and ``region (q,)`` that of the vertices.
-    """
-    own = region[cKDTree(frame.vertices).query(frame.free_edge)[1]]
-    between = cKDTree(frame.vertices[region == UNKNOWN]).query(frame.free_edge)[0]
-    return np.where(between < border, UNKNOWN, own)
-
-
-def _rim(frame: Frame) -> IntArray:
-    """The border of a frame's surface, as triangles without area ``(e, 3)``."""
-    edges = np.sort(directed_edges(frame.triangles), axis=1)
-    once, count = np.unique(edges, axis=0, return_counts=True)
-    return np.asarray(once[count == 1][:, [0, 1, 1]])

@@ -1,8 +1,7 @@
-"""What is not known of the geometry that the model of a case is built from.
+"""Uncertain geometry of the model of a case, as independent modes of one standard deviation each.
 
-That is its open shape, annulus and papillary tips, thickness and direction of fibres, all as they
-were seen or stated. Each is uncertain: independent modes, one standard deviation each. What they do
-to a prediction is in `mvest.personalisation.sources`.
+Open shape, annulus, papillary tips, thickness and fibre direction are measured or stated with
+errors. `mvest.personalisation.sources` computes what the modes do to a prediction.
 """
 
 from __future__ import annotations
@@ -29,44 +28,42 @@ from mvest.valve.geometry.triangles import surface_edges
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NuisanceGeometry:
-    """How well the geometry of a case is known: standard deviations, 0 where it is known exactly.
+    """Standard deviations of the geometry of a case; 0: known exactly.
 
-    The defaults are choices: a third of the spread between observers of a leaflet in 3D
-    echocardiography for the open shape, which a case takes from the sharpest frame; a voxel for the
-    annulus; two for the tips, of which images show the muscle rather than a point; the size of a
-    patch of chordal branches for the insertions; thickness and fibres as they vary between hearts.
+    The defaults are choices: for the open shape a third of the spread between observers of a
+    leaflet in 3D echocardiography; a voxel for the annulus; two voxels for the tips, of which
+    images show the muscle; the size of a patch of chordal branches for the insertions; for
+    thickness and fibres the variation between hearts.
 
     Attributes
     ----------
     shape_mm, shape_length_mm : float
-        Of each coordinate of the open shape, and over which distance its errors are alike.
+        Of each coordinate of the open shape, and the correlation length of these errors.
     annulus_mm, annulus_length_mm : float
-        Of the closed annulus.
+        The same of the closed annulus.
     leaflet_scale, annulus_scale, frame_scale : float
-        Relative: of the length of each leaflet from annulus to free edge in the open frame, of the
-        size of the closed annulus, and of all lengths of all frames together. Errors that are alike
-        over a few millimetres hardly contain them, and an outline drawn too wide is one of them.
+        Relative errors of the length of each leaflet from annulus to free edge in the open frame,
+        of the size of the closed annulus, and of all lengths of all frames. Errors correlated over
+        a few millimetres hardly contain them, but an outline drawn too wide does.
     tips_mm : float
         Of each coordinate of a papillary tip.
     insertions_mm : float
-        Of each coordinate of where a chord ends, along the leaflet.
+        Of each coordinate of a chordal insertion, along the leaflet.
     rest_lengths : float
-        Relative, of the rest length of each chord that was laid out by the shape of the frames,
-        beside a factor on all of them. Those that a case states are as long as it says, up to that
-        factor.
+        Relative, of the rest length of each chord that was laid out from the frames, besides a
+        common factor. Stated rest lengths have only the common factor.
     thickness : float
         Relative, of each leaflet.
     fibre_degrees : float
         Of each leaflet.
     factor : float
-        How well the scale of the open shape's and the annulus' errors is known itself, where errors
-        are learned: one standard deviation of its logarithm, as a factor.
+        One standard deviation, as a factor, of the size of errors of open shape and annulus, if
+        errors are learned.
     share : float
-        Of the variance of smooth modes that is represented; finer ones are left out.
+        Share of the variance that smooth modes represent; finer modes are dropped.
     renewals : int
-        How often, at most, all is estimated anew about the geometry that the last estimate expects:
-        with it, what is not known of the geometry is of first order about there, and not about what
-        was seen. Each costs somewhat less than the estimate.
+        How often, at most, the geometry is relinearised about its posterior mean instead of the
+        measured one. Each takes somewhat less time than the estimate.
     """
 
     shape_mm: Length = 0.3
@@ -86,7 +83,7 @@ class NuisanceGeometry:
     renewals: Count = 0
 
     def __post_init__(self) -> None:
-        what = "considered geometry"
+        what = "nuisance geometry"
         scales = "leaflet_scale", "annulus_scale", "frame_scale"
         sizes = "shape_mm", "annulus_mm", "tips_mm", "insertions_mm", "rest_lengths", "thickness"
         require_numbers(self, what, *scales, *sizes, "fibre_degrees", "renewals", least=0)
@@ -98,15 +95,15 @@ class NuisanceGeometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GeometryModes:
-    """Independent errors of one kind of a geometry, one standard deviation each.
+    """Independent errors of one kind of geometry, one standard deviation each.
 
     Attributes
     ----------
     name : str
     parts : mapping
-        Of `mvest.closure.rest_geometry.PARTS` -> ``(q, ...)``, what each mode does to it.
+        Of `mvest.closure.rest_geometry.PARTS` -> ``(q, ...)``, the change by each mode.
     factor : float
-        To which their size is known.
+        One standard deviation, as a factor, of their size.
     """
 
     name: str
@@ -120,7 +117,7 @@ class GeometryModes:
 def displacement(
     modes: Sequence[GeometryModes], sizes: Sequence[FloatArray]
 ) -> dict[str, FloatArray]:
-    """What as much ``(q,)`` of each kind does to a geometry, for `RestGeometry.displaced`."""
+    """Change of a geometry by amplitudes ``(q,)`` of each kind, for `RestGeometry.displaced`."""
     total: dict[str, FloatArray] = {}
     for own, z in zip(modes, sizes, strict=True):
         for part, moves in own.parts.items():
@@ -129,54 +126,49 @@ def displacement(
 
 
 def geometry_modes(
-    case: ValveCase, considered: NuisanceGeometry, model: ClosureModel
+    case: ValveCase, nuisance: NuisanceGeometry, model: ClosureModel
 ) -> tuple[GeometryModes, ...]:
-    """What is not known of the geometry that the closure of a case is built from.
-
-    Where samples tell how all frames may be in error, only what they do not tell is considered.
-    """
-    surface, geometry = case.surface, RestGeometry(model)
+    """Uncertain geometry of a case; error samples, if it has any, replace errors of the frames."""
+    surface, count = case.surface, len(case.valve.chordae)
     kinds: list[GeometryModes] = []
     if case.error_samples is None:
-        if considered.shape_mm:
-            modes = smooth_modes(surface.vertices, considered.shape_length_mm, considered.share)
-            moves = considered.shape_mm * _each_way(modes)
-            kinds.append(GeometryModes("open shape", {"shape": moves}, considered.factor))
-        if considered.leaflet_scale:
-            moves = considered.leaflet_scale * leaflet_scales(case)
+        if nuisance.shape_mm:
+            modes = smooth_modes(surface.vertices, nuisance.shape_length_mm, nuisance.share)
+            moves = nuisance.shape_mm * _each_way(modes)
+            kinds.append(GeometryModes("open shape", {"shape": moves}, nuisance.factor))
+        if nuisance.leaflet_scale:
+            moves = nuisance.leaflet_scale * leaflet_scales(case)
             kinds.append(GeometryModes("leaflet scale", {"shape": moves}))
         annulus = model.contact_valve.motion.annulus[-1]
-        if considered.annulus_scale:
-            moves = considered.annulus_scale * (annulus - annulus.mean(axis=0))[None]
+        if nuisance.annulus_scale:
+            moves = nuisance.annulus_scale * (annulus - annulus.mean(axis=0))[None]
             kinds.append(GeometryModes("annulus scale", {"annulus": moves}))
-        if considered.annulus_mm:
-            modes = smooth_modes(annulus, considered.annulus_length_mm, considered.share)
-            moves = considered.annulus_mm * _each_way(modes)
-            kinds.append(GeometryModes("annulus", {"annulus": moves}, considered.factor))
-        if considered.tips_mm:
-            moves = considered.tips_mm * _each_way(np.eye(len(case.valve.papillary_tips)))
+        if nuisance.annulus_mm:
+            modes = smooth_modes(annulus, nuisance.annulus_length_mm, nuisance.share)
+            moves = nuisance.annulus_mm * _each_way(modes)
+            kinds.append(GeometryModes("annulus", {"annulus": moves}, nuisance.factor))
+        if nuisance.tips_mm:
+            moves = nuisance.tips_mm * _each_way(np.eye(len(case.valve.papillary_tips)))
             lengths = rest_lengths_by_tips(case, moves)
             follow = {} if lengths is None else {"rest_lengths": lengths}
             kinds.append(GeometryModes("papillary tips", {"tips": moves} | follow))
-    if considered.insertions_mm:
-        ends = np.eye(len(case.valve.chordae))[:, None, :, None]
-        moves = considered.insertions_mm * ends * geometry.along_ends()[:, :, None]
-        kinds.append(
-            GeometryModes("insertions", {"insertions": moves.reshape(-1, *moves.shape[2:])})
-        )
-    if considered.rest_lengths and case.chordae_follow:
-        changes = considered.rest_lengths * np.eye(len(case.valve.chordae))
+    if nuisance.insertions_mm:
+        ends = np.eye(count)[:, None, :, None] * RestGeometry(model).along_ends()[:, :, None]
+        moves = nuisance.insertions_mm * ends.reshape(-1, *ends.shape[2:])
+        kinds.append(GeometryModes("insertions", {"insertions": moves}))
+    if nuisance.rest_lengths and case.chordae_follow:
+        changes = nuisance.rest_lengths * np.eye(count)
         kinds.append(GeometryModes("rest lengths", {"rest_lengths": changes}))
-    if considered.thickness:
-        factors = considered.thickness * _leaflets(surface)
+    if nuisance.thickness:
+        factors = nuisance.thickness * _leaflets(surface)
         kinds.append(GeometryModes("thickness", {"thickness": factors}))
-    if considered.frame_scale:
-        # A valve of twice the size under the same pressure has the same shape if it is twice as
-        # thick: all lengths seen too large are leaflets that are too thin.
-        factors = considered.frame_scale * np.ones((1, len(surface.vertices)))
+    if nuisance.frame_scale:
+        # Twice the size and twice the thickness give the same shape under the same pressure. So
+        # lengths measured too large act as leaflets that are too thin.
+        factors = nuisance.frame_scale * np.ones((1, len(surface.vertices)))
         kinds.append(GeometryModes("frame scale", {"thickness": factors}))
-    if considered.fibre_degrees:
-        angles = np.deg2rad(considered.fibre_degrees) * np.eye(len(surface.region_names))
+    if nuisance.fibre_degrees:
+        angles = np.deg2rad(nuisance.fibre_degrees) * np.eye(len(surface.region_names))
         kinds.append(GeometryModes("fibres", {"fibres": angles}))
     return tuple(kinds)
 
@@ -184,7 +176,7 @@ def geometry_modes(
 def smooth_modes(points: FloatArray, length: float, share: float) -> FloatArray:
     """Modes ``(q, n)`` of a smooth field of unit variance over points ``(n, d)``.
 
-    Leading eigenvectors of its Matérn correlation, as many as have a share of its variance.
+    Leading eigenvectors of its Matérn correlation that together have a share of its variance.
     """
     basis = smooth_basis(points, length)
     order = np.argsort(basis.w)[::-1]
@@ -194,11 +186,11 @@ def smooth_modes(points: FloatArray, length: float, share: float) -> FloatArray:
 
 
 BLEND_STEPS = 10
-"""Averages over neighbours by which the scale of one leaflet fades into that of the next."""
+"""Averages over neighbours that blend the scale of one leaflet into that of the next."""
 
 
 def leaflet_scales(case: ValveCase) -> FloatArray:
-    """Displacements ``(regions, n, 3)`` mm that make each leaflet twice as long, from its annulus.
+    """Displacements ``(regions, n, 3)`` mm that double the length of each leaflet.
 
     A vertex moves away from the point of the annulus at the same angle; the annulus stays.
     """
@@ -223,18 +215,13 @@ def _each_way(modes: FloatArray) -> FloatArray:
 
 
 def _leaflets(surface: LeafletSurface) -> FloatArray:
-    """Of each region ``(r, n)`` whether a vertex is its own."""
+    """Indicator ``(regions, n)`` of the vertices of each leaflet."""
     own = surface.vertex_region == np.arange(len(surface.region_names))[:, None]
     return own.astype(np.float64)
 
 
 def rest_lengths_by_tips(case: ValveCase, moves: FloatArray) -> FloatArray | None:
-    """As `rest_lengths_by_ends` where tips ``(q, t, 3)`` mm are in error in all frames alike.
-
-    What is hard to make out is so at any time.
-    """
-    if not case.chordae_follow:
-        return None
+    """As `rest_lengths_by_ends`, for tips with the same error ``(q, t, 3)`` mm in all frames."""
     away = -moves[:, case.chordae.tip]
     return rest_lengths_by_ends(case, away, away)
 
@@ -242,18 +229,17 @@ def rest_lengths_by_tips(case: ValveCase, moves: FloatArray) -> FloatArray | Non
 def rest_lengths_by_ends(
     case: ValveCase, open_moves: FloatArray, closed_moves: FloatArray
 ) -> FloatArray | None:
-    """Relative change ``(q, c)`` of the chordae's rest lengths where they follow from the frames.
+    """Relative change ``(q, c)`` of rest lengths that were laid out from the frames.
 
-    They are in proportion to a chord's distance in the closed frame, or, where that would be too
-    short, in the open one (`mvest.cases.tissue.lay_out_chordae`). Where vertices of the
-    closed frame do not correspond, so that it is not known where a chord ends there, the open one
-    stands for it. None: they are known by themselves.
+    They are proportional to a chord's length in the closed frame, or in the open frame if that
+    needs more (`mvest.cases.tissue.lay_out_chordae`). A closed frame without correspondence does
+    not show the insertions, so the open frame replaces it. None if rest lengths were stated.
 
     Parameters
     ----------
     case : ValveCase
     open_moves, closed_moves : (q, c, 3) mm
-        By which the end of each chord moves against its tip in these frames.
+        Displacement of the insertion of each chord relative to its tip in these frames.
     """
     if not case.chordae_follow:
         return None

@@ -1,4 +1,4 @@
-"""The posterior of a case's parameters and of the errors of its geometry together."""
+"""The joint posterior of a case's parameters and the errors of its geometry."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from mvest.typing import FloatArray
 T = TypeVar("T")
 
 TRIALS = 4
-"""Of how far a step towards the geometry that is expected is gone."""
+"""Lengths of one damped step that are tried."""
 
-AS_PROMISED = 0.75
-"""Part of the gain that a first order promises with which a step is good enough."""
+AS_PREDICTED = 0.75
+"""Share of the gain predicted to first order that ends the damping of a step."""
 
 
 @dataclass(frozen=True)
 class JointPosterior:
-    """Of parameters m and modes of the geometry's errors, with all other errors as learned.
+    """Posterior of parameters m and geometry modes, with all other errors marginalised.
 
     Attributes
     ----------
     prior : Gaussian
-        Of the parameters in filter coordinates.
+        Of the parameters in filter coordinates z.
     transform : Transform
     observation : Observed
-        As it was seen.
+        As measured.
     errors : FrameErrors
-        With what the geometry does.
+        With linearised effects of the geometry.
     learned : LearnedNoise or None
-        By which they are known; None: as they are stated.
+        None: errors as stated.
     """
 
     prior: Gaussian
@@ -59,86 +59,68 @@ class JointPosterior:
 
     @cached_property
     def marginal(self) -> ObservationNoise:
-        """Of the observation, with what all modes of the geometry add to it."""
-        return low_rank_noise(self.noise, np.concatenate(self._sized, axis=1))
+        """Of the observation with the geometry marginalised."""
+        return low_rank_noise(self.noise, np.concatenate(self._rows, axis=1))
 
     @cached_property
-    def _sized(self) -> tuple[FloatArray, ...]:
-        """The observation by modes of unit variance, of each kind ``(k, q)``."""
+    def _rows(self) -> tuple[FloatArray, ...]:
+        """Effect ``(k, q)`` of modes of unit variance on the observation, by kind."""
         sizes = self.errors.geometry_sizes(self.learned)
         return tuple(s * own.rows for s, own in zip(sizes, self.errors.geometry, strict=True))
 
     def expected(self, residual: FloatArray) -> tuple[FloatArray, ...]:
-        """Most probable modes ``(q,)`` of each kind, where the parameters are as estimated.
+        """Most probable amplitudes ``(q,)`` of the modes by kind, at the estimated parameters.
 
-        Parameters
-        ----------
-        residual : (k,)
-            Of the estimate, from a geometry as it was seen.
+        ``residual (k,)`` is that of the estimate from the measured geometry.
         """
         white = self.marginal.whiten(residual)
         return tuple(
             s * (self.marginal.whiten(rows).T @ white)
-            for s, rows in zip(self.errors.geometry_sizes(self.learned), self._sized, strict=True)
+            for s, rows in zip(self.errors.geometry_sizes(self.learned), self._rows, strict=True)
         )
 
-    def improbability(
-        self, z: FloatArray, residual: FloatArray, modes: tuple[FloatArray, ...]
-    ) -> float:
+    def misfit(self, z: FloatArray, residual: FloatArray, modes: tuple[FloatArray, ...]) -> float:
         """Twice the negative logarithm of the density, up to a constant.
 
         Parameters
         ----------
         z : (p,)
-            Parameters in filter coordinates.
         residual : (k,)
             Of the observation.
         modes : tuple of (q,)
-            Of each kind; empty: the geometry is as it was seen.
+            Amplitudes by kind; empty: the measured geometry.
         """
         moved, white = z - self.prior.mean, self.noise.whiten(residual)
         own = moved @ np.linalg.solve(self.prior.covariance, moved)
         sizes = self.errors.geometry_sizes(self.learned) if modes else ()
-        beside = sum(np.sum((q / s) ** 2) for q, s in zip(modes, sizes, strict=True))
-        return float(own + white @ white + beside)
+        geometry = sum(np.sum((q / s) ** 2) for q, s in zip(modes, sizes, strict=True))
+        return float(own + white @ white + geometry)
 
-    def improbability_of(
+    def misfit_at(
         self, m: FloatArray, prediction: Prediction, modes: tuple[FloatArray, ...]
     ) -> float:
-        """The same of a valve that was closed with parameters ``m (p,)`` and such a geometry."""
+        """The misfit of a valve closed with parameters ``m (p,)`` and this geometry."""
         seen = predict(self.observation.of(lambda _: prediction), m)
-        return self.improbability(self.transform.forward(m), self.observation.y - seen.y, modes)
+        return self.misfit(self.transform.forward(m), self.observation.y - seen.y, modes)
 
-    def stepped(
-        self, z: FloatArray, residual: FloatArray, H: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Parameters ``(p,)`` after one more step to their mode, and the residual ``(k,)`` there.
-
-        To first order, whatever the modes are: a filter that ends as soon as its next step is
-        small has not gone it.
+    def step(self, z: FloatArray, residual: FloatArray, H: FloatArray) -> FloatArray:
+        """Parameters ``(p,)`` after a Gauss-Newton step with the geometry marginalised.
 
         Parameters
         ----------
         z : (p,)
-            An estimate in filter coordinates.
         residual : (k,)
-            Of the observation that it was made from.
+            Of the observation at ``z``.
         H : (k, p)
-            Derivatives of what is predicted there.
+            Derivatives of the prediction by ``z``.
         """
         innovation = residual + H @ (z - self.prior.mean)
-        end = kalman_update(self.prior, innovation, H, self.marginal).posterior.mean
-        return end, residual - H @ (end - z)
+        return kalman_update(self.prior, innovation, H, self.marginal).posterior.mean
 
     def refitted(self, m: FloatArray, prediction: Prediction) -> FloatArray:
-        """Parameters ``(p,)`` with which a valve of this geometry fits best, to first order.
+        """Best parameters ``(p,)`` for a known geometry, one Gauss-Newton step from ``m (p,)``.
 
-        Parameters
-        ----------
-        m : (p,)
-            With which it was closed.
-        prediction : Prediction
-            What was predicted there, with derivatives.
+        ``prediction`` is that of the closed valve at ``m``, with derivatives.
         """
         z = self.transform.forward(m)
         seen = predict(self.observation.of(lambda _: prediction), m, derivatives=True)
@@ -150,23 +132,22 @@ class JointPosterior:
 
 
 def damped_step(
-    trial: Callable[[float], tuple[float, T] | str], here: float, promised: float
+    trial: Callable[[float], tuple[float, T] | str], here: float, predicted: float
 ) -> T | str:
-    """What is most probable on the way of a step of Gauss and Newton, or why there is nothing.
+    """The best point along a Gauss-Newton step, or why there is none.
 
-    All of the way where the first order on which it rests reaches as far, otherwise as far as a
-    parabola through what is found has it, so that steps across a curved valley do not go to and
-    fro. Empty if all of it could be tried and nothing was more probable than where it begins.
+    The full step is taken where the first order holds; otherwise a parabola through the trials
+    gives the length, so that steps across a curved valley do not oscillate. Empty if the full step
+    was possible but nothing is better than the start.
 
     Parameters
     ----------
     trial : callable
-        Share of the way -> twice the negative logarithm of the density there and what is there, or
-        why there is nothing.
+        Share of the step -> misfit and point there, or why there is none.
     here : float
-        The same where it begins.
-    promised : float
-        By how much it falls on all of the way, to first order.
+        Misfit at the start.
+    predicted : float
+        Decrease of the misfit by the full step, to first order.
     """
     best: T | None = None
     lowest, share, why = here, 1.0, ""
@@ -178,9 +159,9 @@ def damped_step(
         value, there = found
         if value < lowest:
             best, lowest = there, value
-        if promised <= 0.0 or here - value > AS_PROMISED * share * (2.0 - share) * promised:
+        if predicted <= 0.0 or here - value > AS_PREDICTED * share * (2.0 - share) * predicted:
             break
-        # Positive: the gain is at most three quarters of what is promised.
-        curvature = (value - here + 2.0 * share * promised) / share**2
-        share = float(np.clip(promised / curvature, 0.2 * share, 0.8 * share))
+        # Positive, because the gain is at most three quarters of the predicted one.
+        curvature = (value - here + 2.0 * share * predicted) / share**2
+        share = float(np.clip(predicted / curvature, 0.2 * share, 0.8 * share))
     return why if best is None else best

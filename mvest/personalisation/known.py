@@ -1,8 +1,8 @@
-"""What an estimate of a case knows, what its intervals rest on, and what would narrow them.
+"""What an estimate of a case determines, where its variance comes from, and what would reduce it.
 
-Everything here follows from one linear model about the estimate: the observation is H z + C g + e
-with unknowns z, modes g of everything else that is in doubt, and errors e of single observations,
-learned with the unknowns. z and g have independent priors: all of it is a few small matrices.
+All of it follows from one linear model about the estimate, H z + C g + e, with unknowns z, modes g
+of all other errors, and errors e of single observations. z and g have independent priors, so only
+small matrices are needed. Results are plain rows, as in `mvest.personalisation.record`.
 """
 
 from __future__ import annotations
@@ -19,94 +19,32 @@ from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.noise import low_rank_noise
 from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import to_filter
+from mvest.estimation.update import kalman_update
 from mvest.personalisation.errors import FrameErrors
-from mvest.personalisation.estimation import CaseEstimate, CaseProblem, slopes
-from mvest.problem.registration import REGISTRATION
+from mvest.personalisation.estimation import CaseEstimate, CaseProblem, joint, slopes
+from mvest.personalisation.geometry import displacement
+from mvest.personalisation.sources import LAW
+from mvest.problem.record import Row
+from mvest.problem.registration import REGISTRATION, label_of
 from mvest.typing import FloatArray
 from mvest.valve.measure.strain import mean_strains
 
 REACH = 1.959963984540054
-"""Standard deviations of a normal distribution to the ends of its 95 % interval."""
+"""Standard deviations from the mean of a normal distribution to the ends of its 95 % interval."""
 
-IMAGES, SINGLE, DOUBT, MODULI = (
-    "errors of the images",
-    "errors of single points",
-    "size of the errors",
-    "prior of the moduli",
-)
-"""Sources of variance beside the unknowns and the errors of geometry and law."""
+IMAGES, SINGLE = "errors of the images", "errors of single points"
+DOUBT, MODULI = "size of the errors", "prior of the moduli"
+"""Sources of variance besides the unknowns and the errors of geometry and law."""
 
 STEP = 1e-3
-"""Of a standard deviation: finite differences of strains."""
+"""Finite difference step of strains, in standard deviations."""
 
-
-@dataclass(frozen=True, slots=True)
-class VarianceShare:
-    """Part of the variance of a modulus' logarithm that one source accounts for."""
-
-    source: str
-    parameter: str
-    share: float
-
-
-@dataclass(frozen=True, slots=True)
-class Narrower:
-    """Standard deviation of a modulus' logarithm now, and if something more were measured.
-
-    Attributes
-    ----------
-    what : str
-        What is measured and how well; `EXACTLY` is the end of all measuring.
-    parameter : str
-    std_now, std_if_known : float
-    """
-
-    what: str
-    parameter: str
-    std_now: float
-    std_if_known: float
-
-
-EXACTLY = "all that can be measured, known exactly"
-
-
-@dataclass(frozen=True, slots=True)
-class Quantity:
-    """Something that follows from an estimate, with its 95 % interval.
-
-    Attributes
-    ----------
-    name, unit : str
-    estimate, low, high : float
-    generic : float or None
-        The same of the generic valve.
-    """
-
-    name: str
-    unit: str
-    estimate: float
-    low: float
-    high: float
-    generic: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class DataAlone:
-    """A modulus (MPa) as the data alone have it, all other priors as they are, to first order.
-
-    Attributes
-    ----------
-    parameter : str
-    estimate, low, high : float
-    prior_stds : float
-        From the mean of its prior, in the prior's standard deviations.
-    """
-
-    parameter: str
-    estimate: float
-    low: float
-    high: float
-    prior_stds: float
+UNITS = {
+    **dict.fromkeys(("shape", "annulus", "tips", "insertions"), ("mm", 1.0)),
+    **dict.fromkeys(("rest_lengths", "thickness"), ("%", 100.0)),
+    "fibres": ("degrees", 180.0 / np.pi),
+}
+"""Part of a geometry -> unit of its errors, and its conversion factor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +56,12 @@ class LinearModel:
     names : tuple of str, (p,)
         Of the unknowns.
     prior : (p, p)
-        Covariance of the unknowns beforehand, in filter coordinates.
+        Covariance of the unknowns, in filter coordinates.
     H : (k, p)
         Derivatives of the observation in these.
     errors : FrameErrors
-        Of the fitted frames beside the unknowns.
     learned : LearnedNoise or None
-        Size of the errors as it was learned; None: as it is stated.
+        None: errors as stated.
     """
 
     names: tuple[str, ...]
@@ -146,7 +83,7 @@ class LinearModel:
 
     @cached_property
     def columns(self) -> Mapping[str, FloatArray]:
-        """Source -> what its modes of unit variance do to the observation ``(k, q)``."""
+        """Source -> effect ``(k, q)`` of its modes of unit variance on the observation."""
         errors = self.errors
         sizes = errors.source_sizes(self.learned)
         own = {source.name: sizes[source.name] * source.rows for source in errors.sources}
@@ -154,12 +91,12 @@ class LinearModel:
 
     @cached_property
     def sources(self) -> tuple[str, ...]:
-        """Source of each unknown and mode, ``(p + q,)``; unknowns are their own."""
+        """Source of each unknown (itself) and of each mode, ``(p + q,)``."""
         modes = [name for name, own in self.columns.items() for _ in range(own.shape[1])]
         return (*self.names, *modes)
 
     def information(self, beats: float = 1.0) -> FloatArray:
-        """What the mean of several beats says of unknowns and modes, ``(p + q, p + q)``."""
+        """Information ``(p + q, p + q)`` of averaged beats about unknowns and modes."""
         noise = self.errors.single_noise(self.learned, beats=beats)
         A = noise.whiten(np.concatenate([self.H, *self.columns.values()], axis=1))
         return np.asarray(A.T @ A)
@@ -175,14 +112,14 @@ class LinearModel:
     def covariance(
         self, sizes: Mapping[str, float] | None = None, beats: float = 1.0
     ) -> FloatArray:
-        """Covariance ``(p + q, p + q)`` of unknowns and modes after the observation.
+        """Posterior covariance ``(p + q, p + q)`` of unknowns and modes.
 
         Parameters
         ----------
         sizes : mapping, optional
-            Source -> factor on its standard deviation beforehand; 0: known exactly.
+            Source -> factor on its prior standard deviation; 0: known exactly.
         beats : float
-            Whose mean is observed.
+            Number of averaged beats.
         """
         J = self._of_one_beat if beats == 1.0 else self.information(beats)
         p = len(self.names)
@@ -196,9 +133,9 @@ class LinearModel:
     def sampled(
         self, sizes: Mapping[str, float] | None = None, beats: float = 1.0
     ) -> SampledPosterior | None:
-        """The same of the unknowns, with gains that have not seen a sample; None without samples.
+        """The same of the unknowns from error samples, with leave-one-out gains; None without.
 
-        A gain that has seen one avoids its direction, and takes nearly all of it for known.
+        A gain that includes a sample avoids its direction, and treats nearly all of it as known.
         """
         samples, sizes = self.errors.samples, sizes or {}
         if samples is None:
@@ -216,15 +153,15 @@ class LinearModel:
         return own.posterior(self.H, self.prior * np.outer(scale, scale))
 
     def variances(self, sizes: Mapping[str, float] | None = None, beats: float = 1.0) -> FloatArray:
-        """Variances ``(p,)`` of the unknowns, what is not known of the errors' size included."""
+        """Variances ``(p,)`` of the unknowns, including the uncertain size of the errors."""
         found = self.sampled(sizes, beats)
         covariance = self.covariance(sizes, beats) if found is None else found.covariance
         own, learned = np.diag(covariance)[: len(self.names)], self.learned
-        # That doubt is of the errors of now; of smaller ones it is as much smaller.
+        # The uncertainty of the errors' size falls with the errors.
         return own if learned is None else own + np.diag(learned.covariance) / beats
 
     def variance_of(self, slopes_: FloatArray) -> FloatArray:
-        """Variances ``(...)`` of what depends on unknowns and modes by slopes ``(..., p + q)``."""
+        """Variances ``(...)`` of functions of unknowns and modes with slopes ``(..., p + q)``."""
         p, covariance = len(self.names), self.covariance()
         if self.learned is not None:
             covariance[:p, :p] += self.learned.covariance
@@ -233,16 +170,16 @@ class LinearModel:
         images = np.array(self.sources) == IMAGES
         rest = slopes_[..., ~images]
         variance = np.einsum("...j,jk,...k->...", rest, covariance[~images][:, ~images], rest)
-        # A sample moves the estimate by as much as the gain has it, and the valve as it says.
+        # A sample moves the valve directly, and the estimate through the gain.
         moved = slopes_[..., :p] @ self._sampled.moved - slopes_[..., images]
         return np.asarray(variance + np.sum(moved**2, axis=-1))
 
     @cached_property
-    def shares(self) -> dict[str, FloatArray]:
-        """Source -> the part ``(p,)`` of the unknowns' variances that it accounts for.
+    def parts(self) -> dict[str, FloatArray]:
+        """Source -> its part ``(p,)`` of the unknowns' variances.
 
-        With the gain K of the estimate its error is K (C g + e) less what the priors are off, in
-        the form of Joseph (`mvest.estimation.sampled`): one term for each independent part.
+        With the gain K the error of the estimate is K (C g + e) minus the error of the prior mean,
+        in Joseph's form (`mvest.estimation.sampled`): one term for each independent part.
         """
         p, J = len(self.names), self._of_one_beat
         own, mixed, modes = J[:p, :p], J[:p, p:], J[p:, p:]
@@ -267,15 +204,27 @@ class LinearModel:
         return parts
 
 
-def variance_shares(model: LinearModel) -> tuple[VarianceShare, ...]:
-    """Where the variance of each modulus comes from; the shares of a modulus add up to 1."""
-    total = np.sum(list(model.shares.values()), axis=0)
-    return tuple(
-        VarianceShare(source, name, float(part[k] / total[k]))
-        for source, part in model.shares.items()
-        for k, name in enumerate(model.names)
-        if k in model.moduli
-    )
+def known_of(problem: CaseProblem, estimate: CaseEstimate) -> dict[str, tuple[Row, ...]]:
+    """Details of an estimate to first order: derived quantities, sources of variance, advice."""
+    filtered = estimate.result.filtered
+    assert filtered is not None
+    model = LinearModel.of(filtered, estimate.point.errors)
+    return {
+        "geometry": tuple(geometry_shifts(problem, estimate)),
+        "known": (*derived_quantities(filtered), *strains(problem, estimate, model)),
+        "data_alone": tuple(data_alone(filtered)),
+        "narrower": tuple(narrower(problem, model)),
+        "shares": tuple(variance_shares(model)),
+    }
+
+
+def variance_shares(model: LinearModel) -> Iterator[Row]:
+    """Sources of the variance of each modulus' logarithm; the shares of a modulus add up to 1."""
+    total = np.sum(list(model.parts.values()), axis=0)
+    for source, part in model.parts.items():
+        for k in model.moduli:
+            share = float(part[k] / total[k])
+            yield {"source": label_of(source), "parameter": model.names[k], "share": share}
 
 
 SOURCES = {
@@ -289,47 +238,50 @@ SOURCES = {
     "fibres": ("direction of the fibres measured to a third of its error now", 1 / 3),
     IMAGES: ("all frames seen twice as sharply", 0.5),
 }
-"""Source of error -> what may be measured of it, and what is then left of its error."""
+"""Source of error -> a possible measurement, and the share of the error that it leaves."""
 
 PRESSURE_MMHG, LENGTHS, STIFFNESS = 3.0, 0.005, 0.05
-"""Errors of a catheter's pressure, and relative ones of the chordae's lengths and stiffness, where
-they are measured. They are choices: the method's own error is not known for a living valve."""
+"""Errors of a catheter's pressure, and relative errors of measured lengths and stiffness of the
+chordae. They are choices: no method's error is known in a living valve."""
 
 BEATS = 4
+EXACTLY = "all that can be measured, known exactly"
 
 
-def narrower(problem: CaseProblem, model: LinearModel) -> tuple[Narrower, ...]:
-    """What may be measured besides, and what it gains; last what measuring can gain at all.
+def narrower(problem: CaseProblem, model: LinearModel) -> Iterator[Row]:
+    """Possible measurements and the standard deviation of each modulus' logarithm with them.
 
-    Errors of mesh and linearisation, which no measurement takes away, and the law of the tissue
-    stay as they are.
+    The last is the limit of all measuring (`EXACTLY`). Errors of mesh and linearisation and the law
+    of the tissue stay, since no measurement removes them.
     """
-    moduli = model.moduli
     measured = dict(_measurable(problem, model))
     exact = {source: 0.0 for sizes in measured.values() for source in sizes}
 
     def std(sizes: Mapping[str, float] | None = None, beats: float = 1.0) -> FloatArray:
-        return np.sqrt(model.variances(sizes, beats))[moduli]
+        return np.sqrt(model.variances(sizes, beats))
 
-    now = std()
-    then = {what: std(sizes) for what, sizes in measured.items()}
+    now, then = std(), {what: std(sizes) for what, sizes in measured.items()}
     then[f"mean of {BEATS} beats"] = std(beats=BEATS)
-    end = np.inf if model.errors.has_floor else BEATS
-    if end == np.inf:
-        then["mean of any number of beats"] = std(beats=end)
-    then[EXACTLY] = std(exact, end)
-    return tuple(
-        Narrower(what, model.names[k], float(now[j]), float(stds[j]))
-        for what, stds in then.items()
-        for j, k in enumerate(moduli)
-    )
+    family = model.errors.family
+    has_floor = family is not None and family.resolution > 0.0
+    if has_floor:  # errors that no averaging removes
+        then["mean of any number of beats"] = std(beats=np.inf)
+    then[EXACTLY] = std(exact, np.inf if has_floor else BEATS)
+    for what, stds in then.items():
+        for k in model.moduli:
+            yield {
+                "what": f"{label_of(model.names[k])}, {what}",
+                "parameter": model.names[k],
+                "std_now": float(now[k]),
+                "std_if_known": float(stds[k]),
+            }
 
 
 def _measurable(problem: CaseProblem, model: LinearModel) -> Iterator[tuple[str, dict[str, float]]]:
-    """What may be measured and how well, in words -> factors on the errors of its sources."""
+    """Possible measurements -> factors on the errors of their sources."""
     stds = {u.name: u.std for u in problem.unknowns}
     pressure = problem.fitted.frames[-1].pressure_mmHg
-    # A scale is of the closed frame's pressure, errors of several frames are in mmHg.
+    # A scale is relative to the closed frame's pressure, errors of several frames are in mmHg.
     now = {
         name: std * (1.0 if is_frame_pressure(name) else pressure)
         for name, std in stds.items()
@@ -353,76 +305,81 @@ def _measurable(problem: CaseProblem, model: LinearModel) -> Iterator[tuple[str,
             yield words, {source: factor}
 
 
-def data_alone(filtered: Estimate) -> tuple[DataAlone, ...]:
+def data_alone(filtered: Estimate) -> Iterator[Row]:
     """Each modulus without its own prior, to first order about the estimate.
 
-    Precisions add up: 1 / v = 1 / v₀ + 1 / v_data of the variances of a modulus' logarithm. Empty
-    for a modulus of which the data say nothing.
+    Precisions add: 1 / v = 1 / v₀ + 1 / v_data for the variances of a modulus' logarithm. Moduli
+    that the data do not determine are left out. ``prior_stds`` is the distance from the prior's
+    mean in the prior's standard deviations.
     """
-    prior = to_filter(filtered.transform, filtered.prior)
-    after = filtered.transformed
-    found = []
+    prior, after = to_filter(filtered.transform, filtered.prior), filtered.transformed
     for k, name in enumerate(filtered.names):
         left = after.std[k] ** 2 / prior.std[k] ** 2
         if not name.startswith("E_f.") or left >= 1.0:
             continue
         step = (after.mean[k] - prior.mean[k]) / (1.0 - left)
         std = after.std[k] / np.sqrt(1.0 - left)
-        middle, reach = prior.mean[k] + step, REACH * std
-        estimate, low, high = np.exp([middle, middle - reach, middle + reach]).tolist()
-        found.append(DataAlone(name, estimate, low, high, float(step / prior.std[k])))
-    return tuple(found)
+        interval = _interval(prior.mean[k] + step, REACH * std)
+        yield {"parameter": name, **interval, "prior_stds": float(step / prior.std[k])}
 
 
-def derived_quantities(filtered: Estimate) -> tuple[Quantity, ...]:
-    """What is known better than the moduli: their ratio, and each for the stated pressure.
+def _interval(log: float, reach: float) -> dict[str, float]:
+    values = np.exp([log, log - reach, log + reach]).tolist()
+    return dict(zip(("estimate", "low", "high"), values, strict=True))
 
-    An error of the pressure moves all moduli together, and so does one of the thickness: neither
-    changes their ratio. A modulus over the factor on the pressure is what the closed shape tells
-    if the stated pressure is right.
+
+def derived_quantities(filtered: Estimate) -> Iterator[Row]:
+    """Quantities known better than the moduli: their ratio, and each at the stated pressure.
+
+    Errors of pressure and thickness move all moduli together and leave their ratio. A modulus over
+    the factor on the pressure follows from the closed shape if the stated pressure is right.
     """
     names = filtered.names
     after, prior = filtered.transformed, to_filter(filtered.transform, filtered.prior)
-    moduli = [k for k, name in enumerate(names) if name.startswith("E_f.")]
 
-    def quantity(name: str, unit: str, direction: Mapping[int, float]) -> Quantity:
+    def quantity(name: str, unit: str, direction: Mapping[int, float]) -> Row:
         d = np.zeros(len(after.mean))
         d[list(direction)] = list(direction.values())
-        middle, reach = float(d @ after.mean), REACH * float(np.sqrt(d @ after.covariance @ d))
-        estimate, low, high = np.exp([middle, middle - reach, middle + reach]).tolist()
-        return Quantity(name, unit, estimate, low, high, float(np.exp(d @ prior.mean)))
+        reach = REACH * float(np.sqrt(d @ after.covariance @ d))
+        generic = float(np.exp(d @ prior.mean))
+        interval = _interval(float(d @ after.mean), reach)
+        return {"name": name, "unit": unit, **interval, "generic": generic}
 
-    regions = {k: names[k].partition(".")[2] for k in moduli}
-    found = [
-        quantity(
-            f"ratio of E_f {regions[moduli[0]]} to {regions[k]}", "", {moduli[0]: 1.0, k: -1.0}
-        )
-        for k in moduli[1:]
-    ]
+    regions = {k: name[4:] for k, name in enumerate(names) if name.startswith("E_f.")}
+    first = min(regions)
+    for k, region in regions.items():
+        if k != first:
+            name = f"ratio of E_f {regions[first]} to {region}"
+            yield quantity(name, "", {first: 1.0, k: -1.0})
     if SCALE in names:
         at = names.index(SCALE)
-        found += [
-            quantity(f"E_f {regions[k]} if the stated pressure is right", "MPa", {k: 1.0, at: -1.0})
-            for k in moduli
-        ]
-    return tuple(found)
+        for k, region in regions.items():
+            name = f"E_f {region} if the stated pressure is right"
+            yield quantity(name, "MPa", {k: 1.0, at: -1.0})
 
 
-def strains(
-    problem: CaseProblem, estimate: CaseEstimate, model: LinearModel
-) -> tuple[Quantity, ...]:
+def strains(problem: CaseProblem, estimate: CaseEstimate, model: LinearModel) -> Iterator[Row]:
     """Mean membrane strain (%) of each leaflet from the open to the closed valve.
 
-    It needs no modulus: what is known of it is what is known of the two shapes. Its variance is
-    that of the fitted valve under the posterior of unknowns and modes together.
+    It depends on the two shapes alone. Its variance is that of the fitted valve under the joint
+    posterior of unknowns and modes.
     """
-    surface, place = problem.case.surface, estimate.place
+    surface, point, errors = problem.case.surface, estimate.point, estimate.point.errors
     fitted = estimate.result.fitted
     assert fitted is not None
     n = len(surface.vertices)
-    frames = place.prediction.y.reshape(-1, n, 3)
+    frames = point.prediction.y.reshape(-1, n, 3)
     shapes = np.stack([frames[0], fitted[-1]])
-    by = _moves(problem, estimate, model)[[0, -1]]
+    # Effect (f, n, 3, p + q) mm of unknowns and modes on the valve, the open frame first.
+    z = problem.transform.forward(point.m)
+    jacobian = point.prediction.jacobian * problem.transform.derivative(z)
+    sizes = errors.source_sizes(model.learned)
+    moves = [jacobian.reshape(-1, n, 3, len(z))]
+    moves += [sizes[source.name] * source.moves for source in errors.sources]
+    if (own := errors.frame_samples) is not None:
+        moved = np.stack([own.opened, own.predicted]) / np.sqrt(len(own))
+        moves.append(np.moveaxis(moved, 1, -1))
+    by = np.concatenate(moves, axis=-1)[[0, -1]]
 
     def of(x: FloatArray) -> FloatArray:
         return mean_strains(x[0], x[1], surface)
@@ -434,30 +391,64 @@ def strains(
     )  # fmt: skip
     values = 100.0 * of(shapes)
     reach = 100.0 * REACH * np.sqrt(model.variance_of(slopes_))
-    return tuple(
-        Quantity(
-            f"strain of the {region} leaflet {way}",
-            "%",
-            float(values[r, d]),
-            float(values[r, d] - reach[r, d]),
-            float(values[r, d] + reach[r, d]),
-        )
-        for r, region in enumerate(surface.region_names)
-        for d, way in enumerate(("along its fibres", "across its fibres"))
-    )
+    for r, region in enumerate(surface.region_names):
+        for d, way in enumerate(("along its fibres", "across its fibres")):
+            yield {
+                "name": f"strain of the {region} leaflet {way}",
+                "unit": "%",
+                "estimate": float(values[r, d]),
+                "low": float(values[r, d] - reach[r, d]),
+                "high": float(values[r, d] + reach[r, d]),
+                "generic": None,
+            }
 
 
-def _moves(problem: CaseProblem, estimate: CaseEstimate, model: LinearModel) -> FloatArray:
-    """What unknowns and modes do to the valve, ``(f, n, 3, p + q)`` mm, the open frame first."""
-    place, errors = estimate.place, estimate.errors
-    n = len(problem.case.surface.vertices)
-    z = problem.transform.forward(place.m)
-    jacobian = place.prediction.jacobian * problem.transform.derivative(z)
-    parts = [jacobian.reshape(-1, n, 3, len(z))]
-    sizes = errors.source_sizes(model.learned)
-    parts += [sizes[source.name] * source.moves for source in errors.sources]
-    if errors.frame_samples is not None:
-        own = errors.frame_samples
-        moved = np.stack([own.opened, own.predicted]) / np.sqrt(len(own))
-        parts.append(np.moveaxis(moved, 1, -1))
-    return np.concatenate(parts, axis=-1)
+def geometry_shifts(problem: CaseProblem, estimate: CaseEstimate) -> Iterator[Row]:
+    """Posterior mean of each kind of geometry error, to first order about the estimate.
+
+    ``size`` is the root mean square over points (distances), chords or leaflets; ``stretch`` is the
+    largest amplitude of a mode in standard deviations, as learned. Nothing if the geometry is
+    known, or described by error samples.
+    """
+    errors, result = estimate.point.errors, estimate.result
+    posterior, residual = joint(problem, result, errors), result.residual
+    if posterior is None or residual is None or errors.samples is not None:
+        return
+    expected, scales = posterior.expected(residual), errors.geometry_sizes(posterior.learned)
+    for source, modes, scale in zip(errors.geometry, expected, scales, strict=True):
+        assert source.modes is not None
+        # Later parts follow from the first, as rest lengths follow from the tips.
+        part = next(iter(source.modes.parts))
+        moved = displacement((source.modes,), (modes,))[part]
+        unit, factor = UNITS[part]
+        square = np.sum(moved**2, axis=-1) if moved.ndim > 1 else moved**2
+        size = factor * float(np.sqrt(np.mean(square)))
+        stretch = float(np.max(np.abs(modes)) / scale)
+        yield {"name": source.name, "unit": unit, "size": size, "stretch": stretch}
+
+
+def law_share(estimate: CaseEstimate) -> float | None:
+    """Most probable position of the tissue between the linear law (0) and the other (1).
+
+    To first order about the estimate, with its errors and priors. None without another law or
+    without an estimate.
+    """
+    errors, result = estimate.point.errors, estimate.result
+    filtered, residual = result.filtered, result.residual
+    rows = [source.rows for source in errors.sources if source.name == LAW]
+    if not rows or filtered is None or residual is None:
+        return None
+    way = rows[0].sum(axis=1)
+    noise = errors.noise(filtered.learned, without=(LAW,))
+    if errors.samples is not None:
+        noise = low_rank_noise(noise, errors.samples.columns)
+    prior, z = to_filter(filtered.transform, filtered.prior), filtered.transformed.mean
+    H = slopes(filtered)
+    innovation = residual + H @ (z - prior.mean)
+
+    def misfit(e: FloatArray) -> float:
+        return kalman_update(prior, e, H, noise).nis
+
+    whole = misfit(way)
+    # A parabola through its values with either law.
+    return 0.5 + 0.5 * (misfit(innovation) - misfit(innovation - way)) / whole if whole else None

@@ -1,4 +1,4 @@
-"""The closure of a case as a function of its unknowns, and the gate: whether it is one state."""
+"""The closure of a case as a function of its unknowns, and the gate on its uniqueness."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mvest.closure.robustness import GATE_CASES, GateReport, run_gate, vary
 from mvest.errors import InputError
 from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.valve_system import HeldState, check_parameters
-from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Prior
+from mvest.personalisation.settings import CaseMesh, PersonaliseSettings
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import Band
@@ -25,9 +25,9 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 
 
 def with_pressures(case: ValveCase, settings: PersonaliseSettings) -> PersonaliseSettings:
-    """The settings with the pressures' errors among the unknowns, where a case has several frames.
+    """The settings with the errors of pressures among the unknowns, if several frames are fitted.
 
-    With one closed frame the factor on the pressure stands for all of them.
+    With one closed frame the common factor on the pressure covers them.
     """
     if settings.pressures is None or not case.fitted:
         return settings
@@ -36,37 +36,9 @@ def with_pressures(case: ValveCase, settings: PersonaliseSettings) -> Personalis
     return replace(settings, unknowns=(*own, *settings.pressures.unknowns(frames)))
 
 
-def frames_model(
-    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel
-) -> FramesModel | None:
-    """All closed frames that are fitted, if they are several; nearest in pressure go first.
-
-    Parameters
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-        From `with_pressures`.
-    model : ClosureModel
-        Of the case.
-
-    Raises
-    ------
-    InputError
-        If errors of pressures are unknown and the factor on all of them is not.
-    """
-    if not case.fitted:
-        return None
-    closed = case.frame(Role.CLOSED)
-    ordered = sorted(case.fitted, key=lambda f: abs(f.pressure_mmHg - closed.pressure_mmHg))
-    states = {frame.name: held_state(model, frame) for frame in ordered}
-    errors = tuple(u.name for u in settings.unknowns if is_frame_pressure(u.name))
-    return FramesModel(model, closed.name, states, closed.pressure_mmHg, errors)
-
-
 def held_state(model: ClosureModel, frame: Frame) -> HeldState:
     """The loads of a further frame, on the contact valve's annulus."""
-    contact = model.contact_valve
-    annulus = frame.annulus
+    contact, annulus = model.contact_valve, frame.annulus
     if contact is not model.valve:
         phi = 360.0 * np.arange(len(contact.annulus)) / len(contact.annulus)
         annulus = Band(model.valve).annulus_positions(phi, frame.annulus)
@@ -76,7 +48,7 @@ def held_state(model: ClosureModel, frame: Frame) -> HeldState:
 def build_model(
     case: ValveCase, settings: PersonaliseSettings, store: Path | None = None
 ) -> ClosureModel:
-    """The closure of a case as a function of its unknowns, those of the registration excluded.
+    """The closure of a case as a function of its unknowns except for the registration.
 
     Parameters
     ----------
@@ -92,7 +64,6 @@ def build_model(
     GeometryError, MeshingError
         If the leaflets cannot be meshed.
     """
-    _check_unknowns(case, settings)
     coarse = build_coarse(case, settings, store)
     shape = GivenValve(case.valve)
     if shape.band is None:
@@ -104,54 +75,40 @@ def build_model(
 def build_coarse(
     case: ValveCase, settings: PersonaliseSettings, store: Path | None = None
 ) -> ClosureModel:
-    """The same on the mesh of the guide alone, where there are two leaflets; see `build_model`."""
-    _check_unknowns(case, settings)
-    mechanical = _mechanical(settings)
-    free = tuple(u.name for u in mechanical if not u.fixed)
-    fixed = {u.name: u.mean for u in mechanical if u.fixed}
-    protocol = settings.mechanics.protocol
-    if case.closed is not None:
-        protocol = replace(protocol, pressure_mmHg=case.closed.pressure_mmHg)
-    mechanics = replace(settings.mechanics, protocol=protocol)
-    shape, mesh = GivenValve(case.valve), settings.mesh
-    if shape.band is not None:
-        mesh = replace(mesh, source="structured", columns=mesh.guide_columns, rows=mesh.guide_rows)
-    solid = _solid(shape, mesh, store)
-    return ClosureModel(
-        shape.given,
-        shape.valve(mesh.contact_columns, mesh.contact_rows),
-        solid,
-        mechanics,
-        free,
-        fixed,
-        continuation=True,
-        repeat=False,
-        largest_change=settings.largest_change,
-    )
-
-
-def _mechanical(settings: PersonaliseSettings) -> list[Prior]:
-    return [
+    """As `build_model`, but on the guide mesh alone if there are two leaflets."""
+    mechanical = [
         u for u in settings.unknowns if not (u.name in REGISTRATION or is_frame_pressure(u.name))
     ]
-
-
-def _check_unknowns(case: ValveCase, settings: PersonaliseSettings) -> None:
-    mechanical = _mechanical(settings)
-    regions = case.surface.region_names
     others = [u.name for u in mechanical if not u.is_modulus]
     try:
         check_parameters(others, case.valve, settings.mechanics)
     except InputError as error:
         raise InputError(f"unknowns: {error}; or some of {', '.join(REGISTRATION)}") from error
+    regions, given = case.surface.region_names, {u.name for u in mechanical if u.is_modulus}
     needed = {f"E_f.{region}" for region in regions}
-    given = {u.name for u in mechanical if u.is_modulus}
     if given != needed:
         raise InputError(
             f"unknown moduli {', '.join(sorted(given))}; case {case.name} has the leaflets "
             f"{', '.join(regions)}: expected {', '.join(sorted(needed))}, or "
             "leaflets named as the unknowns are"
         )
+    protocol = settings.mechanics.protocol
+    if case.closed is not None:
+        protocol = replace(protocol, pressure_mmHg=case.closed.pressure_mmHg)
+    shape, mesh = GivenValve(case.valve), settings.mesh
+    if shape.band is not None:
+        mesh = replace(mesh, source="structured", columns=mesh.guide_columns, rows=mesh.guide_rows)
+    return ClosureModel(
+        shape.given,
+        shape.valve(mesh.contact_columns, mesh.contact_rows),
+        _solid(shape, mesh, store),
+        replace(settings.mechanics, protocol=protocol),
+        tuple(u.name for u in mechanical if not u.fixed),
+        {u.name: u.mean for u in mechanical if u.fixed},
+        continuation=True,
+        repeat=False,
+        largest_change=settings.largest_change,
+    )
 
 
 def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
@@ -162,20 +119,19 @@ def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseClosure:
-    """The closure of a case's valve, in the forms in which the parts of an estimation take it.
+    """The closure of a case's valve in the forms that an estimation needs.
 
     Attributes
     ----------
     model : ClosureModel
     frames : FramesModel or None
-        All closed frames that are fitted, if they are several.
+        All fitted closed frames, if there are several.
     registered : RegisteredModel
-        The same, displaced as a whole before it is seen.
+        The same, with the rigid displacement of the observed frames.
     shared : SharedStart
         The same, for many estimations.
     displacement : mapping
-        Part -> by what the geometry differs from the one that was seen; see
-        `RestGeometry.displaced`.
+        Part -> difference from the measured geometry; see `RestGeometry.displaced`.
     """
 
     model: ClosureModel
@@ -193,14 +149,14 @@ class CaseClosure:
         start: FloatArray,
         displacement: Mapping[str, FloatArray] | None = None,
     ) -> CaseClosure:
-        """The closure of a valve, gone on from ``start (p,)`` in the order of ``names``."""
+        """The closure of a valve, starting at ``start (p,)`` in the order of ``names``."""
         registered = RegisteredModel(frames or model, names)
         return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
 
     def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> CaseClosure:
-        """Of the valve with another geometry, see `RestGeometry.displaced`.
+        """Closure of the valve with another geometry, see `RestGeometry.displaced`.
 
-        All closed frames have the same errors of annulus and tips, as their derivatives say.
+        All closed frames have the same errors of annulus and tips, as in their derivatives.
         """
         model, names = RestGeometry(self.model).displaced(parts), self.registered.names
         closure = self.of(model, self.frames, names, start, parts)
@@ -211,7 +167,7 @@ class CaseClosure:
         return self.of(model, frames, names, start, parts)
 
     def held(self, state: HeldState) -> HeldState:
-        """A state as it was seen, whose annulus and tips are off as those of this valve."""
+        """A measured state with the displaced annulus and tips of this valve."""
         return replace(
             state,
             annulus=state.annulus + self.displacement.get("annulus", 0.0),
@@ -220,42 +176,28 @@ class CaseClosure:
 
 
 def gate_case(
-    case: ValveCase,
-    settings: PersonaliseSettings,
-    store: Path | None = None,
+    case: ValveCase, settings: PersonaliseSettings, store: Path | None = None
 ) -> GateReport:
-    """Ask whether the closed state of a case is one, with the prior means of its unknowns.
+    """Test that the closed state of a case is unique, at the prior means of its unknowns.
 
-    Variations that need another mesh or other contact samples are left out: those of a case are as
-    its surface gives them.
-
-    Parameters
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-    store : Path, optional
-        Where an unstructured mesh is kept.
-
-    Raises
-    ------
-    MvestError
-        If the case is not in order.
+    Variations with another mesh or other contact samples are skipped, because the surface of a
+    case fixes both. Parameters and errors are those of `build_model`.
     """
     model = build_model(case, settings, store)
     means = {unknown.name: unknown.mean for unknown in settings.unknowns}
-    kept = [
+    possible = [
         each
         for each in GATE_CASES
         if not each.remeshed and (model.guide is not None or not each.guided)
     ]
     at = np.array([means[name] for name in model.names])
-    return run_gate(lambda variation: vary(model, variation), at, kept)
+    return run_gate(lambda variation: vary(model, variation), at, possible)
 
 
 def gate_lines(report: GateReport) -> list[str]:
-    """What a gate's report comes to, in lines: the verdict, and what it fails by."""
+    """A gate's report in lines: the verdict, then the failures."""
     largest = np.nanmax([row.max_mm for row in report.rows])
-    verdict = "passed" if report.passed else "NOT passed: the closed state is not one"
+    verdict = "passed" if report.passed else "NOT passed: the closed state is not unique"
     lines = [
         f"  gate {verdict}; {len(report.rows) - 1} variations, {largest:.2g} mm at most, and "
         f"{len(report.paths)} ways along the moduli"

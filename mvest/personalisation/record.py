@@ -1,24 +1,24 @@
 """The record of a personalised case, and the arrays that its report draws.
 
-`EstimateRecord.details` of a case holds plain rows by name, for the report and for tables. A name
-whose rows were not computed is missing. Lengths are in mm, intervals hold 95 %.
+`EstimateRecord.details` of a case holds plain rows by name, for reports and tables. Names without
+rows are missing. Lengths are in mm, intervals hold 95 %.
 
 ============== ==================================================================================
 name           columns of a row
 ============== ==================================================================================
 about          (one row) description, source, licence, sha256, regions, derived, implausible,
                confirmed_mm (largest distance of the fitted closed valve from the one closed anew),
-               law_share (how far the tissue is expected to be on its way from the linear law to an
-               exponential one), error_samples (how many entered)
+               law_share (estimated position of the tissue between the linear law and an
+               exponential one), error_samples (their number)
 settings       setting, value
 check          (one row) compared, value, limit: `mvest.estimation.check.ApproximationCheck`
 errors         name, unit (empty: a factor), believed, believed_low, believed_high, learned, low,
-               high, stretch: what was learned of the errors of the closed frame
-geometry       name, unit, size, stretch: `mvest.personalisation.result.GeometryShift`
-known          name, unit, estimate, low, high, generic: what follows from the estimate
-               (`mvest.personalisation.known.Quantity`)
+               high, stretch: errors of the closed frame, as stated and as learned
+geometry       name, unit, size, stretch: estimated errors of the geometry by kind
+               (`mvest.personalisation.known.geometry_shifts`)
+known          name, unit, estimate, low, high, generic: derived quantities
 data_alone     parameter, estimate, low, high, prior_stds: moduli without their priors
-shares         source, parameter, share: where the variance of a modulus' logarithm comes from
+shares         source, parameter, share: sources of the variance of a modulus' logarithm
 narrower       what, parameter, std_now, std_if_known: SD of the logarithm of a modulus
 measurements   frame, shape (observed, generic or personalised), and one column for each of
                `mvest.valve.measure.clinical.clinical_measurements`
@@ -28,8 +28,8 @@ image_step     with image_frames and pictures: `DetectedValve.details`
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ from scipy.spatial import cKDTree
 from mvest.cases.case import Role
 from mvest.cases.plausibility import implausible_values
 from mvest.personalisation.diagnostics import diagnostics_of
-from mvest.personalisation.result import FrameDistance, Personalised
+from mvest.personalisation.result import Personalised
 from mvest.problem.estimate import StudyResult
 from mvest.problem.fields import as_stored
 from mvest.problem.record import (
@@ -50,19 +50,15 @@ from mvest.problem.record import (
     finite,
     record_of,
 )
-from mvest.problem.registration import label_of
 from mvest.problem.verdict import judge
-from mvest.typing import FloatArray
 from mvest.valve.measure.clinical import clinical_measurements
-
-Rows = tuple[Row, ...]
 
 
 def record_of_case(
     fit: Personalised,
     *,
     gate: bool | None = None,
-    images: Mapping[str, Rows] | None = None,
+    images: Mapping[str, tuple[Row, ...]] | None = None,
 ) -> EstimateRecord:
     """The record of a personalised case.
 
@@ -70,29 +66,33 @@ def record_of_case(
     ----------
     fit : Personalised
     gate : bool, optional
-        Whether its anatomy has passed the gate; None if that was not tested.
+        Whether its anatomy passed the gate; None if untested.
     images : mapping, optional
-        What `DetectedValve.details` states of the volume that the case is from.
+        `DetectedValve.details` of the volume that the case comes from.
     """
-    result, images = fit.result, images or {}
-    others = {"moduli_only": fit.moduli_only, "paper": fit.paper}
+    images = images or {}
     unlike = images["image_step"][0]["unlike"] if "image_step" in images else ""
-    details = {name: tuple(rows) for name, rows in _details(fit).items()} | dict(images)
-    return _record(fit, result).model_copy(
+    details = {**_details(fit), **fit.details, **images}
+    return _record(fit, fit.result).model_copy(
         update={
             "verdict": judge(diagnostics_of(fit, gate, unlike)),
-            "correlation": _correlation(result),
-            "frames": tuple(map(_frame_fit, fit.distances)),
-            "alternatives": {
-                name: _record(fit, other) for name, other in others.items() if other is not None
-            },
+            "correlation": _correlation(fit.result),
+            "frames": tuple(
+                FrameFit(
+                    frame=one.frame.name,
+                    seen=one.seen,
+                    **{model: Spread.of(values) for model, values in one.distances.items()},
+                )
+                for one in fit.frames
+            ),
+            "alternatives": {name: _record(fit, other) for name, other in fit.alternatives.items()},
             "details": {name: rows for name, rows in details.items() if rows},
         }
     )
 
 
 def _record(fit: Personalised, result: StudyResult) -> EstimateRecord:
-    """The record of one of a case's estimations, with its priors as they were stated."""
+    """The record of one of a case's estimations, with the priors as stated."""
     record = record_of(result, case=fit.case.name, simulated=fit.case.simulated)
     stated = {
         own.name: {"prior_mean": own.mean, "prior_std": own.std} for own in fit.settings.unknowns
@@ -102,7 +102,7 @@ def _record(fit: Personalised, result: StudyResult) -> EstimateRecord:
 
 
 def _correlation(result: StudyResult) -> tuple[Numbers, ...]:
-    """Of the errors of the estimates, in the coordinates of the filter."""
+    """Posterior correlation of the unknowns in filter coordinates."""
     if result.filtered is None or result.estimate is None:
         return ()
     after = result.filtered.transformed
@@ -110,17 +110,9 @@ def _correlation(result: StudyResult) -> tuple[Numbers, ...]:
     return tuple(tuple(map(finite, row)) for row in share.tolist())
 
 
-def _frame_fit(distance: FrameDistance) -> FrameFit:
-    models = {
-        name: Spread.of(getattr(distance, name))
-        for name in ("generic", "registered", "personalised")
-    }
-    return FrameFit(frame=distance.frame, seen=distance.seen, **models)
-
-
-def _details(fit: Personalised) -> dict[str, Iterable[Row]]:
-    """Name -> rows; see the head of this module."""
-    case, known, filtered = fit.case, fit.known, fit.result.filtered
+def _details(fit: Personalised) -> dict[str, tuple[Row, ...]]:
+    """Name -> rows, as far as `Personalised.details` lacks them."""
+    case, filtered = fit.case, fit.result.filtered
     check = None if filtered is None else filtered.check
     about = {
         "description": case.description,
@@ -131,7 +123,7 @@ def _details(fit: Personalised) -> dict[str, Iterable[Row]]:
         "derived": list(case.derived),
         "implausible": list(map(str, implausible_values(case))),
         "confirmed_mm": fit.confirmed_mm,
-        "law_share": known.law_share,
+        "law_share": fit.law_share,
         "error_samples": fit.error_samples,
     }
     checked = check and {
@@ -140,26 +132,16 @@ def _details(fit: Personalised) -> dict[str, Iterable[Row]]:
         "limit": check.limit,
     }
     return {
-        "about": [about],
-        "settings": _settings("", fit.settings),
-        "check": [checked] if checked else [],
-        "errors": _errors(fit.result),
-        "geometry": map(asdict, known.geometry),
-        "known": map(asdict, known.quantities),
-        "data_alone": map(asdict, known.data_alone),
-        "narrower": (
-            asdict(row) | {"what": f"{label_of(row.parameter)}, {row.what}"}
-            for row in known.narrower
-        ),
-        "shares": (asdict(row) | {"source": label_of(row.source)} for row in known.shares),
-        "measurements": _measurements(fit),
+        "about": (about,),
+        "settings": tuple(_settings("", asdict(fit.settings))),
+        "check": (checked,) if checked else (),
+        "errors": tuple(_errors(fit.result)),
+        "measurements": tuple(_measurements(fit)),
     }
 
 
 def _settings(name: str, value: Any) -> Iterator[Row]:
-    """The settings below ``name``, a row each; unknowns are in the record itself."""
-    if is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    """The settings below ``name``, one row each; the record itself has the unknowns."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             if key != "unknowns":
@@ -172,48 +154,36 @@ def _settings(name: str, value: Any) -> Iterator[Row]:
 def _errors(result: StudyResult) -> Iterator[Row]:
     learned = None if result.filtered is None else result.filtered.learned
     for quantity in () if learned is None else learned.quantities:
-        low, high = quantity.learned.interval()
-        before = quantity.believed.interval()
-        yield {
-            "name": quantity.name,
-            "unit": "" if quantity.is_factor else "mm",
-            "believed": float(quantity.believed.median),
-            "believed_low": float(before[0]),
-            "believed_high": float(before[1]),
-            "learned": float(quantity.learned.median),
-            "low": float(low),
-            "high": float(high),
-            "stretch": float(quantity.stretch),
-        }
+        row: dict[str, Any] = {"name": quantity.name, "unit": "" if quantity.is_factor else "mm"}
+        for name, belief in (("believed", quantity.believed), ("learned", quantity.learned)):
+            prefix = "believed_" if name == "believed" else ""
+            ends = zip(("low", "high"), belief.interval(), strict=True)
+            row[name] = float(belief.median)
+            row |= {prefix + end: float(value) for end, value in ends}
+        yield row | {"stretch": float(quantity.stretch)}
 
 
 def _measurements(fit: Personalised) -> Iterator[Row]:
     case, surface = fit.case, fit.case.surface
     reach = fit.settings.mechanics.contact.activation_distance * float(surface.thickness.mean())
+    compared = {one.frame.name: one.positions for one in fit.frames}
     for frame in case.frames:
-        shapes: dict[str, FloatArray] = {}
-        if frame.corresponds:
-            shapes["observed"] = frame.vertices
-        for which, positions in (("generic", fit.generic), ("personalised", fit.fitted)):
-            if frame.name in positions:
-                shapes[which] = positions[frame.name]
+        shapes = {"observed": frame.vertices} if frame.corresponds else {}
+        if frame.name in compared:
+            shapes |= {which: compared[frame.name][which] for which in ("generic", "personalised")}
         for which, points in shapes.items():
-            yield {
-                "frame": frame.name,
-                "shape": which,
-                **clinical_measurements(
-                    points, surface, points[case.annulus], frame.papillary_tips, reach
-                ),
-            }
+            measured = clinical_measurements(
+                points, surface, points[case.annulus], frame.papillary_tips, reach
+            )
+            yield {"frame": frame.name, "shape": which, **measured}
 
 
 def arrays_of_case(fit: Personalised) -> dict[str, Any]:
     """The arrays (mm) that `mvest.reporting.case` draws; empty without an estimate."""
-    if not fit.distances:
+    if not fit.frames:
         return {}
     case, surface = fit.case, fit.case.surface
-    by_name = {frame.name: frame for frame in case.frames}
-    frames = [by_name[distance.frame] for distance in fit.distances]
+    frames = [one.frame for one in fit.frames]
     edge_thickness = surface.thickness[case.free_edge].mean()
     arrays: dict[str, Any] = {
         "triangles": surface.triangles,
@@ -222,20 +192,19 @@ def arrays_of_case(fit: Personalised) -> dict[str, Any]:
         "annulus": case.annulus,
         "free_edge": case.free_edge,
         "frames": [frame.name for frame in frames],
-        "seen": [distance.seen for distance in fit.distances],
+        "seen": [one.seen for one in fit.frames],
         "tips": [case.frame(Role.REFERENCE).papillary_tips, *(f.papillary_tips for f in frames)],
         "chord_tip": case.chordae.tip,
         "chord_insertion": cKDTree(surface.vertices).query(case.chordae.insertion)[1],
-        "generic": [fit.generic[frame.name] for frame in frames],
-        "registered": [fit.registered[frame.name] for frame in frames],
-        "fitted": [fit.fitted[frame.name] for frame in frames],
+        "generic": [one.positions["generic"] for one in fit.frames],
+        "registered": [one.positions["registered"] for one in fit.frames],
+        "fitted": [one.positions["personalised"] for one in fit.frames],
         "reach_mm": fit.settings.mechanics.contact.activation_distance * edge_thickness,
     }
-    if not all(frame.corresponds for frame in frames):
+    if all(frame.corresponds for frame in frames):
+        arrays["observed"] = [frame.vertices for frame in frames]
+        for name, model in (("generic", "generic"), ("fitted", "personalised")):
+            arrays[f"distance_{name}"] = [one.distances[model] for one in fit.frames]
+    else:
         arrays |= {f"observed_points_{frame.name}": frame.vertices for frame in frames}
-        return as_stored(arrays)
-    arrays["observed"] = [frame.vertices for frame in frames]
-    if fit.settings.correspondence:
-        arrays["distance_generic"] = [distance.generic for distance in fit.distances]
-        arrays["distance_fitted"] = [distance.personalised for distance in fit.distances]
     return as_stored(arrays)

@@ -1,4 +1,4 @@
-"""How a case is personalised: what is unknown of it, and what it is computed on."""
+"""Settings of a personalisation: unknowns with priors, mesh, filter and sources of error."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from mvest.quantities import (
 )
 
 STIFFENS = "stiffening."
-"""How the names of unknowns begin that say how far a leaflet's tissue stiffens."""
+"""Prefix of unknowns that say how much the tissue of a leaflet stiffens."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is known beforehand of one unknown of a case.
+    """The prior of one unknown of a case.
 
     Attributes
     ----------
     name : str
-        One of the mechanics' (:data:`mvest.mechanics.parameters.KINDS`): ``E_f.REGION`` (MPa),
-        ``pressure_scale`` (a factor) ..., or ``shift.x`` ... (mm) or ``turn.x`` ... (degrees).
+        A parameter of the mechanics (:data:`mvest.mechanics.parameters.KINDS`) such as
+        ``E_f.REGION`` (MPa), or ``shift.x`` ... (mm), or ``turn.x`` ... (degrees).
     mean, std : float
         In the same unit.
     fixed : bool
@@ -65,32 +65,30 @@ class Prior:
 
     @property
     def is_modulus(self) -> bool:
-        """Whether it is what is asked for, and not a nuisance."""
+        """Whether it is a modulus and not a nuisance."""
         return self.name.startswith("E_f.")
 
     @property
     def is_positive(self) -> bool:
-        """Whether it is estimated by its logarithm."""
-        if self.name in REGISTRATION or is_frame_pressure(self.name):
-            return False
-        return is_positive(self.name)
+        """Whether its logarithm is estimated."""
+        displaces = self.name in REGISTRATION or is_frame_pressure(self.name)
+        return not displaces and is_positive(self.name)
 
 
 @dataclass(frozen=True, slots=True)
 class PressureErrors:
-    """How well the stated pressures of several closed frames are known, besides a common factor.
+    """Errors of the stated pressures of several closed frames, besides a common factor.
 
-    With one closed frame they and the factor (``pressure_scale``) are one and the same, and the
-    factor's prior stands for all.
+    With one closed frame the prior of the factor (``pressure_scale``) covers them.
 
     Attributes
     ----------
     offset_mmHg : float
-        Standard deviation of an offset that all of them have, as where the zero of a measurement
-        is not that of the left atrium; 0: none.
+        Standard deviation of a common offset, for example of the zero of the measurement from left
+        atrial pressure; 0: none.
     each_mmHg : float
-        Of the error that each has for itself, as where a frame falls on a steep part of the curve
-        that its pressure is read from; 0: none.
+        Standard deviation of the independent error of each frame, for example on a steep part of
+        the pressure curve; 0: none.
     """
 
     offset_mmHg: PressureError = 5.0
@@ -100,7 +98,7 @@ class PressureErrors:
         require_numbers(self, "pressures", "offset_mmHg", "each_mmHg", least=0)
 
     def unknowns(self, frames: Iterable[str]) -> tuple[Prior, ...]:
-        """What is not known of the pressures of these frames."""
+        """The unknown errors of the pressures of these frames."""
         stds = {OFFSET: self.offset_mmHg}
         stds |= {f"{ERROR}.{frame}": self.each_mmHg for frame in frames}
         return tuple(Prior(name, 0.0, std) for name, std in stds.items() if std)
@@ -108,22 +106,22 @@ class PressureErrors:
 
 @dataclass(frozen=True, slots=True)
 class CaseMesh:
-    """What a case is computed on.
+    """Meshes of a case.
 
     Attributes
     ----------
     source : str
         ``structured``: layers of cells in material coordinates (two leaflets only); ``tetwild``: an
-        unstructured mesh of the thickened leaflets; ``automatic``: the first where there are two
-        leaflets, otherwise the second.
+        unstructured mesh of the thickened leaflets; ``automatic``: structured for two leaflets,
+        otherwise unstructured.
     columns, rows : int
         Cells of a structured mesh.
     guide_columns, guide_rows : int
-        Cells of the coarser mesh on which the first closure is followed.
+        Cells of the coarser guide mesh, which leads the first closure.
     edge_length : float
         mm, of an unstructured mesh.
     contact_columns, contact_rows : int
-        Samples of contact.
+        Sample points of contact.
     """
 
     source: str = "automatic"
@@ -137,15 +135,15 @@ class CaseMesh:
 
     @property
     def error_share(self) -> float:
-        """Share of its difference from the mesh of the guide by which a mesh is off.
+        """Error of the mesh as a share of its difference from the guide mesh.
 
-        Of a structured one by the extrapolation of Richardson for errors of second order; of an
-        unstructured one, which is no refinement of the guide, all of it.
+        Richardson extrapolation of second order; for an unstructured mesh, which does not refine
+        the guide, the whole difference.
         """
-        if self.source != "tetwild":
-            finer = self.columns / self.guide_columns
-            return 1.0 / (finer**2 - 1.0) if finer > 1.0 else 0.0
-        return 1.0
+        if self.source == "tetwild":
+            return 1.0
+        finer = self.columns / self.guide_columns
+        return 1.0 / (finer**2 - 1.0) if finer > 1.0 else 0.0
 
     def __post_init__(self) -> None:
         if self.source not in ("automatic", "structured", "tetwild"):
@@ -156,12 +154,14 @@ class CaseMesh:
 
 @dataclass(frozen=True, slots=True)
 class PaperSettings:
-    """The paper's filter, which knows of no nuisance: all in MPa² and mm².
+    """The paper's filter for the moduli alone, without nuisances.
 
     Attributes
     ----------
-    P0, Q, R : float
-        Variances of the prior and of the process, and of a coordinate as seen.
+    P0, Q : float
+        MPa², variances of prior and process.
+    R : float
+        mm², variance of an observed coordinate.
     max_iterations : int
     """
 
@@ -173,7 +173,7 @@ class PaperSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaseChoices:
-    """How a case is personalised, but for its unknowns and its mechanics.
+    """Settings of a personalisation other than unknowns and mechanics.
 
     Attributes
     ----------
@@ -182,28 +182,24 @@ class CaseChoices:
         Of the filter, relative.
     max_iterations : int
     largest_change : float
-        Of a parameter's logarithm from one equilibrium to the next, see
+        Of a parameter's logarithm between equilibria, see
         :class:`mvest.closure.model.ClosureModel`.
     paper : PaperSettings or None
-        Whether the moduli are also estimated as the paper does it.
+        Also estimate the moduli with the paper's filter.
     moduli_only : bool
-        Whether they are also estimated with all nuisances fixed, but otherwise as here.
+        Also estimate the moduli with all nuisances fixed.
     confirm : bool
-        Whether the fitted valve is closed anew from the open one.
-    correspondence : bool
-        Whether corresponding vertices are used as such; otherwise only where the surface is.
+        Close the fitted valve anew from the open state, for comparison.
     errors : ErrorBeliefs or None
-        How well the errors are known that the case states: they are learned with the unknowns;
-        None takes them as they are stated.
+        How well the stated errors are known; they are learned with the unknowns. None: exactly.
     nuisance_geometry : NuisanceGeometry or None
-        How well the geometry is known that the model is built from: what is not counts as an error
-        of the observation. None takes it as it was seen.
+        Uncertainty of the model's geometry, which widens the intervals. None: no uncertainty.
     nuisance_law : dict of str to ExponentialTissue
-        Leaflet -> another law that its tissue may follow: what it would do to the prediction counts
-        as an error of the observation. Empty: the linear law is taken to be right.
+        Leaflet -> another law that its tissue may follow, which widens the intervals. Empty: the
+        linear law is right.
     pressures : PressureErrors or None
-        How well stated pressures are known where several closed frames are fitted; None: each of
-        them but for the common factor, if that is an unknown.
+        Errors of the pressures of several fitted closed frames. None: only the common factor, if
+        that is an unknown.
     """
 
     mesh: CaseMesh = field(default_factory=CaseMesh)
@@ -213,7 +209,6 @@ class CaseChoices:
     paper: PaperSettings | None = None
     moduli_only: bool = False
     confirm: bool = False
-    correspondence: bool = True
     errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
     nuisance_geometry: NuisanceGeometry | None = None
     nuisance_law: dict[str, ExponentialTissue] = field(default_factory=dict)
@@ -222,21 +217,21 @@ class CaseChoices:
 
 @dataclass(frozen=True, slots=True)
 class PersonaliseSettings(CaseChoices):
-    """How a case is personalised.
+    """Settings of a personalisation.
 
     Attributes
     ----------
     unknowns : tuple of Prior
-        The means of the moduli are the generic ones.
+        The means of the moduli are the generic values.
     mechanics : MechanicsSettings
-        The pressure of its protocol is replaced by that of the closed frame.
+        The closed frame's pressure replaces that of the protocol.
     """
 
     unknowns: tuple[Prior, ...]
     mechanics: MechanicsSettings
 
     def __post_init__(self) -> None:
-        IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # refuses what is none
+        IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # checks both
         names = [unknown.name for unknown in self.unknowns]
         if len(set(names)) != len(names):
             raise InputError(f"unknowns {', '.join(names)} are not all different")
@@ -254,9 +249,9 @@ class PersonaliseSettings(CaseChoices):
 
 
 def with_stiffening(settings: PersonaliseSettings) -> PersonaliseSettings:
-    """The settings where tissue whose stiffening is an unknown is on its way to another law.
+    """Replace the linear law of leaflets whose stiffening is unknown by a law in between.
 
-    That law is the one that would be considered otherwise (`PersonaliseSettings.nuisance_law`).
+    The unknown leads from the linear law to that of `PersonaliseSettings.nuisance_law`.
 
     Raises
     ------
@@ -275,23 +270,13 @@ def with_stiffening(settings: PersonaliseSettings) -> PersonaliseSettings:
             )
         if region not in laws:
             raise InputError(
-                f"unknown {unknown.name}: nuisance_law.{region} is missing, the law that the "
-                "tissue is on its way to"
+                f"unknown {unknown.name}: nuisance_law.{region} is missing, the law of fully "
+                "stiffened tissue"
             )
         tissue[region] = replace(tissue[region], law="stiffening", exponential=laws.pop(region))
     mechanics = replace(settings.mechanics, tissue=tissue)
     return replace(settings, mechanics=mechanics, nuisance_law=laws)
 
-
-UNKNOWNS = (
-    Prior("E_f.anterior", 6.23, 3.1),
-    Prior("E_f.posterior", 2.09, 1.05),
-    Prior("pressure_scale", 1.0, 0.1),
-    Prior("chord_stiffness", 1.0, 0.2),
-    Prior("chord_rest_length", 1.0, 0.02),
-    *(Prior(name, 0.0, 1.0 if name.startswith("shift") else 2.0) for name in REGISTRATION),
-)
-"""Priors; moduli in MPa, displacements in mm and degrees."""
 
 CUFF = 0.15
 """Relative standard deviation of a pressure from a cuff and Doppler."""
@@ -304,23 +289,34 @@ CURVES = {
 
 
 def default_settings(case: ValveCase) -> PersonaliseSettings:
-    """The settings that fit where a case is from: surfaces, or a volume with its error samples.
+    """Settings that suit the source of a case: surfaces, or a volume with error samples.
+
+    Moduli are in MPa, displacements in mm and degrees.
 
     Parameters
     ----------
     case : ValveCase
         With an anterior and a posterior leaflet.
     """
-    surfaces = PersonaliseSettings(
-        tuple(
-            replace(unknown, std=CUFF) if unknown.name == "pressure_scale" else unknown
-            for unknown in UNKNOWNS
+    # Leaflets, annulus and tips of one volume are not displaced against each other, and the error
+    # samples contain their errors.
+    from_volume = case.error_samples is not None
+    unknowns = (
+        Prior("E_f.anterior", 6.23, 3.1),
+        Prior("E_f.posterior", 2.09, 1.05),
+        Prior("pressure_scale", 1.0, 0.1 if from_volume else CUFF),
+        Prior("chord_stiffness", 1.0, 0.2),
+        Prior("chord_rest_length", 1.0, 0.02),
+        *(
+            Prior(name, 0.0, 1.0 if name.startswith("shift") else 2.0, from_volume)
+            for name in REGISTRATION
         ),
+    )
+    ratios = {"anterior": 6.23 / 2.35, "posterior": 2.09 / 1.89}
+    surfaces = PersonaliseSettings(
+        unknowns,
         MechanicsSettings(
-            {
-                "anterior": TissueSettings(6.23 / 2.35),
-                "posterior": TissueSettings(2.09 / 1.89),
-            },
+            {region: TissueSettings(ratio) for region, ratio in ratios.items()},
             newton=NewtonSettings(max_halvings=3),
         ),
         moduli_only=True,
@@ -338,16 +334,10 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
         nuisance_law=CURVES,
         pressures=PressureErrors(),
     )
-    if case.error_samples is None:
+    if not from_volume:
         return surfaces
-    # Leaflets, annulus and tips come from one volume: nothing is displaced against anything else,
-    # and their errors are in the samples.
     return replace(
         surfaces,
-        unknowns=tuple(
-            replace(unknown, fixed=True) if unknown.name in REGISTRATION else unknown
-            for unknown in UNKNOWNS
-        ),
         errors=ErrorBeliefs(resolution_mm=0.3),
         nuisance_geometry=NuisanceGeometry(
             shape_mm=0.0, annulus_mm=0.0, tips_mm=0.0, frame_scale=0.02, rest_lengths=0.04

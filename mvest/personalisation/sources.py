@@ -1,8 +1,13 @@
-"""Errors of what a model is built from, its geometry and its law, as errors of what it predicts.
+"""Errors of geometry, law, mesh and frames of a model, as errors of its prediction.
 
-Each is a few independent modes of one standard deviation. What they do to the closed valve, to
-first order, are columns C of the observation, which add C Cᵀ to the covariance of its errors. That
-is the same as to estimate all modes with the parameters, and to report the parameters alone.
+Each source is a few independent modes of one standard deviation. To first order their effects on
+the closed valve are columns C of the observation, which add C Cᵀ to its error covariance. That
+equals estimating the modes with the parameters and reporting the parameters alone.
+
+Error samples of a case are complete valves with other open shape, annulus, papillary tips and
+chordae. The linear change of the predicted closed valve (`mvest.closure.rest_geometry`) minus the
+change of its closed frame is one sample of the error of the innovation. Common errors of both
+frames cancel as far as they move the valve as a whole.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import FramesModel
 from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
@@ -23,35 +29,37 @@ from mvest.mechanics.reference import RestVariation
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import Simulation
 from mvest.mechanics.valve_system import HeldState
-from mvest.personalisation.geometry import GeometryModes
+from mvest.personalisation.geometry import GeometryModes, rest_lengths_by_ends
 from mvest.problem.estimate import Observed
 from mvest.problem.registration import RegisteredModel, registration_of
 from mvest.typing import FloatArray
+from mvest.valve.anatomy.band import Band
+from mvest.valve.geometry.proximity import closest_points
 
 LAW, MESH = "law", "mesh"
 """Names of the errors of the tissue's law and of the mesh."""
 
 VISIBLE = 0.3
-"""Standard deviations of the stated noise below which a combination of columns is left out."""
+"""Standard deviations of the stated noise below which a combination of columns is dropped."""
 
 TOLERANCE = 1e-3
-"""Of derivatives, relative, far below what is known of the size of errors."""
+"""Relative, of derivatives; far below the uncertainty of the size of errors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorSource:
-    """One thing that is not known of the valve: independent modes, one standard deviation each.
+    """One uncertain property of the valve: independent modes of one standard deviation each.
 
     Attributes
     ----------
     columns : ErrorColumns
-        What the modes do to the observation, of low rank as far as noise lets it be told.
+        Effect of the modes on the observation, reduced to what noise does not hide.
     rows : (k, q)
-        The same of every mode.
+        Effect of every mode.
     moves : (f, n, 3, q) mm
-        The same of the observed valve, the open frame first.
+        Effect of every mode on the observed valve, the open frame first.
     modes : GeometryModes or None
-        Those of a geometry; None of the law.
+        Of a geometry; None for law and mesh.
     """
 
     columns: ErrorColumns
@@ -65,97 +73,127 @@ class ErrorSource:
         return self.columns.name
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedValve:
+    """A closed valve at which errors are linearised.
+
+    Attributes
+    ----------
+    registered : RegisteredModel
+        Its last closed state is the starting state.
+    m : (p,)
+        Parameters of the closed valve.
+    predicted : array
+        All its frames, stacked.
+    """
+
+    registered: RegisteredModel
+    m: FloatArray
+    predicted: FloatArray
+
+    def closure(self) -> tuple[ClosureModel, FloatArray, list[HeldState]]:
+        """The closure, its parameters, and the loads of further frames."""
+        model, at = self.registered.model, self.registered.mechanical(self.m)
+        if not isinstance(model, FramesModel):
+            return model, at, []
+        return model.model, at, model.under(self.registered.own(self.m), model.states)
+
+    def turned(self, change: FloatArray) -> FloatArray:
+        """Changes ``(f, n, 3, q)`` mm as observed: rotated in all frames except the open one."""
+        vector = registration_of(self.registered.names, self.m)[3:]
+        turn = Rotation.from_rotvec(vector, degrees=True).as_matrix()
+        return np.concatenate([change[:1], np.einsum("ij,fnjq->fniq", turn, change[1:])])
+
+    def rows(self, observation: Observed, moves: FloatArray) -> FloatArray:
+        """Effect ``(k, q)`` of observed changes ``(f, n, 3, q)`` mm on an observation."""
+        jacobian = moves.reshape(len(self.predicted), -1)
+        linear = observation.of(lambda _: Prediction(self.predicted, jacobian))
+        return predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian
+
+
 def geometry_sources(
     modes: Sequence[GeometryModes],
-    registered: RegisteredModel,
+    valve: ClosedValve,
     observation: Observed,
     noise: ObservationNoise,
-    m: FloatArray,
-    predicted: FloatArray,
     seen: ClosureModel | None = None,
 ) -> tuple[ErrorSource, ...] | str:
-    """Errors of an observation from those of the geometry, by kind, or why they are not known.
+    """Errors of an observation by those of the geometry, by kind, or why they are unknown.
 
     Parameters
     ----------
     modes : sequence of GeometryModes
+    valve : ClosedValve
     observation : Observed
         Of the case.
     noise : ObservationNoise
-        Of single observations as it is stated.
-    registered, m, predicted, seen
-        As of `mvest.personalisation.errors.linearise`.
+        Of single observations, as stated.
+    seen : ClosureModel, optional
+        Of the measured geometry, if that of ``valve`` is displaced.
     """
     if not modes:
         return ()
-    model, at, states = closure_at(registered, m)
+    model, at, states = valve.closure()
     geometry = RestGeometry(model, seen)
     joined = RestVariation.joined([geometry.variation(own.parts) for own in modes])
     change = geometry.change(at, joined, states, TOLERANCE)
     if isinstance(change, str):
         return change
-    moves = seen_change(registered, m, change)
-    rows = observed_change(observation, predicted, moves)
+    moves = valve.turned(change)
+    rows = valve.rows(observation, moves)
     ends = np.cumsum([len(own) for own in modes])[:-1]
+    parts = zip(modes, np.split(rows, ends, axis=1), np.split(moves, ends, axis=3), strict=True)
     return tuple(
-        ErrorSource(
-            ErrorColumns(own.name, of_low_rank(by, noise), own.factor), by, moved, modes=own
-        )
-        for own, by, moved in zip(
-            modes, np.split(rows, ends, axis=1), np.split(moves, ends, axis=3), strict=True
-        )
+        ErrorSource(ErrorColumns(own.name, of_low_rank(by, noise), own.factor), by, moved, own)
+        for own, by, moved in parts
     )
 
 
 def law_and_mesh_sources(
     tissue: Mapping[str, ExponentialTissue],
     mesh_share: float,
-    registered: RegisteredModel,
+    valve: ClosedValve,
     observation: Observed,
-    m: FloatArray,
-    predicted: FloatArray,
 ) -> tuple[ErrorSource, ...] | str:
-    """Errors of an observation from those of law and mesh, or why they are not known.
+    """Errors of an observation by those of law and mesh, or why they are unknown.
 
-    A case is estimated with the linear law, and tissue stiffens: at the same mean stress its shape
-    is another. One leaflet after another gets an exponential tissue that is as stiff as the linear
-    one where closed leaflets are stretched. By how much the new equilibrium moves what is observed
-    is one standard deviation of how far the tissue is on its way from one law to the other.
-
-    What a mesh leaves of the error of a coarser one, where there is one, is one standard deviation
-    of the error of the mesh.
+    Tissue stiffens, so at the same mean stress its shape differs from that of the linear law. Each
+    leaflet in turn gets an exponential tissue that is as stiff as the linear one at the stretch of
+    closed leaflets. The change of the equilibrium is one standard deviation of the position of the
+    tissue between both laws. The error of the mesh has a share of its difference from the guide
+    mesh, if there is one, as standard deviation.
 
     Parameters
     ----------
     tissue : mapping
-        Region -> exponential tissue, of which only the shape of its curve counts.
+        Region -> exponential tissue; only the shape of its curve counts.
     mesh_share : float
-        Share of the difference between both meshes that the finer one is off; 0: not asked.
-    registered, observation, m, predicted
-        As of `geometry_sources`; at ``m`` the tissues are as stiff as the linear ones.
+        0: without mesh errors.
+    valve, observation
+        As of `geometry_sources`.
     """
-    model, at, states = closure_at(registered, m)
+    model, at, states = valve.closure()
     coarse = model.guide or model
     first = coarse.rests(np.asarray(at, dtype=np.float64), states)
     if not first[-1].converged:
         return first[-1].reason.value
-    found = []
+    changes: dict[str, FloatArray] = {}
     if tissue:
         change = law_change(coarse, at, states, tissue, first)
         if isinstance(change, str):
             return change
-        moves = seen_change(registered, m, change)
-        rows = observed_change(observation, predicted, moves)
-        found.append(ErrorSource(ErrorColumns(LAW, rows), rows, moves))
+        changes[LAW] = valve.turned(change)
     if mesh_share and model.guide is not None:
-        fine = predicted.reshape(-1, *model.valve.surface.vertices.shape)
+        fine = valve.predicted.reshape(-1, *model.valve.surface.vertices.shape)
         moves = np.zeros((*fine.shape, 1))
-        moves[1:, ..., 0] = mesh_share * (
-            fine[1:] - registered.seen(_observed(coarse, first)[1:], m)
-        )
-        rows = observed_change(observation, predicted, moves)
-        found.append(ErrorSource(ErrorColumns(MESH, rows), rows, moves))
-    return tuple(found)
+        coarser = valve.registered.seen(_observed(coarse, first)[1:], valve.m)
+        moves[1:, ..., 0] = mesh_share * (fine[1:] - coarser)
+        changes[MESH] = moves
+    rows = {name: valve.rows(observation, moves) for name, moves in changes.items()}
+    return tuple(
+        ErrorSource(ErrorColumns(name, rows[name]), rows[name], moves)
+        for name, moves in changes.items()
+    )
 
 
 def law_change(
@@ -165,20 +203,18 @@ def law_change(
     tissue: Mapping[str, ExponentialTissue],
     first: Sequence[Simulation],
 ) -> FloatArray | str:
-    """Change ``(f, n, 3, q)`` mm of the observed valve with another law, or why there is none.
+    """Change ``(f, n, 3, q)`` mm of the observed valve by another law, or the reason for failure.
 
-    The open valve is the first frame and stays, the closed one the last; the states come between
-    them.
+    The frames are the open valve, which stays, the states, and the closed valve.
 
     Parameters
     ----------
     model : ClosureModel
-        On a coarse mesh: a closure that follows no guide takes as long as an estimation on a fine
-        one.
+        On a coarse mesh: closing a fine one without a guide takes as long as an estimation.
     m : (p,)
         Parameters of the closure.
     states : sequence of HeldState
-        Under other loads, gone to from the closed valve.
+        Under other loads, reached from the closed valve.
     tissue : mapping
         As for `law_and_mesh_sources`.
     first : sequence of Simulation
@@ -200,8 +236,8 @@ def law_change(
             fixed={known: value for known, value in model.fixed.items() if known != name},
             guide=None,
         )
-        kept = at[[known != name for known in model.names]]
-        moved = other.rests(kept, states, start=first[0].frames[-1])
+        others = at[[known != name for known in model.names]]
+        moved = other.rests(others, states, start=first[0].frames[-1])
         if not moved[-1].converged:
             return f"{region} of an exponential law: {moved[-1].reason.value}"
         changes.append(_observed(model, moved) - _observed(model, first))
@@ -215,33 +251,63 @@ def _observed(model: ClosureModel, ends: Sequence[Simulation]) -> FloatArray:
     return np.stack([model.observed(model.mesh.nodes), *others, closed])
 
 
-def closure_at(
-    registered: RegisteredModel, m: FloatArray
-) -> tuple[ClosureModel, FloatArray, list[HeldState]]:
-    """The closure of a model, its parameters at ``m (p,)``, and what further frames are held by."""
-    model = registered.model
-    if not isinstance(model, FramesModel):
-        return model, registered.mechanical(m), []
-    return model.model, registered.mechanical(m), model.under(registered.own(m), model.states)
-
-
-def seen_change(registered: RegisteredModel, m: FloatArray, change: FloatArray) -> FloatArray:
-    """Changes ``(f, n, 3, q)`` mm of the valve as they are seen, all frames but the open turned."""
-    turn = Rotation.from_rotvec(registration_of(registered.names, m)[3:], degrees=True).as_matrix()
-    return np.concatenate([change[:1], np.einsum("ij,fnjq->fniq", turn, change[1:])])
-
-
-def observed_change(observation: Observed, predicted: FloatArray, moves: FloatArray) -> FloatArray:
-    """What seen changes ``(f, n, 3, q)`` mm of the valve do to an observation ``(k, q)``.
-
-    ``predicted`` are all frames, stacked.
-    """
-    jacobian = moves.reshape(len(predicted), -1)
-    linear = observation.of(lambda _: Prediction(predicted, jacobian))
-    return predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian
-
-
 def of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:
-    """Fewer columns with nearly the same C Cᵀ, as far as that can be told from noise."""
+    """Fewer columns with the same C Cᵀ except for directions hidden by the noise."""
     _, s, Vt = np.linalg.svd(noise.whiten(columns), full_matrices=False)
     return np.asarray(columns @ Vt[s > VISIBLE].T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSamples:
+    """Samples of the change of a prediction by measurement errors of the frames it is built from.
+
+    Attributes
+    ----------
+    predicted : (K, n, 3) mm
+        Displacement of the predicted closed valve.
+    seen, opened : (K, n, 3) mm
+        Displacement of the observed closed and of the open frame in the same samples.
+    """
+
+    predicted: FloatArray
+    seen: FloatArray
+    opened: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.seen)
+
+
+def sample_frames(case: ValveCase, valve: ClosedValve) -> FrameSamples | str:
+    """Change of the closed valve by each error sample of its case, or why it is unknown."""
+    samples = case.error_samples
+    assert samples is not None
+    model, at, states = valve.closure()
+    geometry, chordae, surface = RestGeometry(model), case.chordae, case.surface
+    roles = [frame.role for frame in case.frames]
+    opened, closed = (roles.index(role) for role in (Role.REFERENCE, Role.CLOSED))
+    moves, tips = samples.vertices, samples.tips
+    annulus = moves[:, closed][:, case.annulus]
+    if model.contact_valve is not model.valve:
+        band, rest = Band(model.valve), model.valve.surface.vertices[model.valve.annulus]
+        count = len(model.contact_valve.annulus)
+        phi = 360.0 * np.arange(count) / count
+        still = band.annulus_positions(phi, rest)
+        annulus = np.stack([band.annulus_positions(phi, rest + own) - still for own in annulus])
+    place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
+
+    def from_tips(frame: int) -> FloatArray:
+        ends = place.interpolate(np.moveaxis(moves[:, frame], 0, -1), surface.triangles)
+        return np.asarray(np.moveaxis(ends, -1, 0) - tips[:, frame][:, chordae.tip])
+
+    rest_lengths = rest_lengths_by_ends(case, from_tips(opened), from_tips(closed))
+    variation = RestVariation.summed(
+        [
+            geometry.shape(moves[:, opened]),
+            geometry.annulus(annulus),
+            geometry.tips(tips[:, closed], rest_lengths),
+        ]
+    )
+    change = geometry.change(at, variation, states, TOLERANCE)
+    if isinstance(change, str):
+        return change
+    return FrameSamples(np.moveaxis(change[-1], -1, 0), moves[:, closed], moves[:, opened])

@@ -1,6 +1,6 @@
-"""The one joint of data, model and filter: problem and observation in, estimate and errors out.
+"""Joins data, model and filter: takes a problem and an observation, returns an estimate.
 
-The truth of a synthetic study is kept apart: ``estimate`` never sees it, and only the finished
+The truth of a synthetic study stays separate. ``estimate`` never sees it; only a finished
 ``StudyResult`` is compared with it (``StudyResult.against``).
 """
 
@@ -29,38 +29,33 @@ from mvest.typing import FloatArray
 
 
 class Observed(Protocol):
-    """What an estimation needs of an observation, whatever its kind."""
+    """What an estimation needs of an observation of any kind."""
 
     @property
     def frames(self) -> tuple[str, ...]:
         """Names of the observed frames, the closed one last."""
-        ...
 
     @property
     def y(self) -> FloatArray:
         """The observation ``(k,)``."""
-        ...
 
     @property
     def R(self) -> NoiseCovariance:
         """Covariance of ``y``."""
-        ...
 
     def of(self, model: ObservationModel, /) -> ObservationModel:
-        """What a model that predicts all frames, stacked, predicts of this observation.
+        """Turn a model of all stacked frames into a model of this observation.
 
-        Its predictions have for ``aux`` the observed frames ``(f, n, 3)`` mm with all vertices.
+        The ``aux`` of its predictions are the observed frames ``(f, n, 3)`` mm, all vertices.
         """
-        ...
 
     def distance(self, fitted: FloatArray) -> FloatArray:
-        """Distances (mm) of what was seen in the last frame to fitted ``(f, n, 3)``."""
-        ...
+        """Distances (mm) between the last observed frame and fitted frames ``(f, n, 3)``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Everything an estimation needs besides the observation.
+    """Everything an estimation needs except the observation.
 
     Attributes
     ----------
@@ -69,11 +64,11 @@ class Problem:
     model : ObservationModel
         Predicts all frames, stacked.
     prior : Gaussian
-        Of the parameters themselves.
+        Of the parameters themselves, in their units.
     filter : Filter
     transform : Transform
     tissue : mapping
-        Region -> the fixed ratios from which its other moduli follow.
+        Region -> fixed ratios that give its other moduli.
     """
 
     parameters: tuple[str, ...]
@@ -92,23 +87,23 @@ class Problem:
 
     @property
     def start(self) -> FloatArray:
-        """Parameters ``(p,)`` at which filters start: the prior's mean but for its last bit."""
+        """Starting point ``(p,)`` of the filters: the prior's mean up to rounding."""
         return self.transform.inverse(self.transform.forward(self.prior.mean))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyResult:
-    """An estimate from an observation, or the reason why there is none.
+    """An estimate from an observation, or the reason for its absence.
 
     Attributes
     ----------
     parameters : tuple of str, (p,)
     tissue : mapping
-        Region -> fixed ratios; empty for a model that knows none.
+        Region -> fixed ratios; empty for models without tissue.
     observation : Observed or None
         None if it could not be simulated.
     filtered : Estimate or None
-        What the filter returned; None if it was never run.
+        What the filter returned; None if it never ran.
     identifiability : Identifiability or None
         Cramér-Rao bound and flat directions of the data alone, at the estimate.
     reason, detail : str
@@ -116,7 +111,7 @@ class StudyResult:
     seconds : float
         Wall-clock time of the estimation.
     fitted : (f, n, 3) mm or None
-        Observed frames as predicted at the estimate, unseen vertices included.
+        Observed frames as predicted at the estimate, with unobserved vertices.
     truth : Truth or None
         Added by ``against``, after the estimation.
     """
@@ -136,44 +131,50 @@ class StudyResult:
     def __str__(self) -> str:
         if self.filtered is None or self.estimate is None:
             return f"no estimate: {self.reason}" + (f" ({self.detail})" if self.detail else "")
-        units = [unit_of(name) for name in self.parameters]
-        lines = [f"{self.filtered.summary(units)}, {self.seconds:.1f} s"]
+        lines = [f"{self.filtered.summary(list(map(unit_of, self.parameters)))}, "
+                 f"{self.seconds:.1f} s"]  # fmt: skip
         if self.distance is not None:
             lines.append(f"fitted to observed: {np.nanmean(self.distance):.2f} mm on average")
         if self.truth is not None:
-            true = dict(zip(self.parameters, self.truth.values, strict=True))
-            lines.append("truth: " + ", ".join(f"{name} {v:.4g}" for name, v in true.items()))
+            true = zip(self.parameters, self.truth.values, strict=True)
+            lines.append("truth: " + ", ".join(f"{name} {v:.4g}" for name, v in true))
         return "\n".join(lines)
 
     @classmethod
     def failed(cls, problem: Problem, reason: str) -> StudyResult:
-        """The result of a study that had nothing to estimate from."""
+        """The result of a study without an observation."""
         return cls(problem.parameters, problem.tissue, None, None, None, reason, "", False, 0.0)
 
     def against(self, truth: Truth | None) -> StudyResult:
-        """The same result, compared with the truth."""
+        """The same result with the truth for comparison."""
         if truth is not None and truth.parameters != self.parameters:
             raise InputError(f"the truth is of {truth.parameters}, not of {self.parameters}")
         return replace(self, truth=truth)
 
     @property
     def estimate(self) -> FloatArray | None:
-        """Estimated parameters ``(p,)``; None where the model gave no prediction there."""
-        known = self.filtered is not None and self.filtered.prediction is not None
-        return self.filtered.mean if known and self.filtered is not None else None
+        """Estimated parameters ``(p,)``; None if the model made no prediction there."""
+        if self.filtered is None or self.filtered.prediction is None:
+            return None
+        return self.filtered.mean
 
     @property
     def std(self) -> FloatArray | None:
         """Standard deviations ``(p,)`` of the estimate according to the filter."""
-        if self.estimate is None or self.filtered is None:
+        return None if self.filtered is None or self.estimate is None else self.filtered.std
+
+    @property
+    def residual(self) -> FloatArray | None:
+        """Observed minus predicted ``(k,)`` at the estimate; None if there is none."""
+        if self.filtered is None or self.filtered.prediction is None or self.observation is None:
             return None
-        return self.filtered.std
+        return self.observation.y - self.filtered.prediction.y
 
     @property
     def distance(self) -> FloatArray | None:
-        """Distance ``(n,)`` mm of each vertex, fitted to observed, in the last observed frame.
+        """Distance (mm) from fitted to observed in the last observed frame.
 
-        NaN where a vertex is not seen. Of seen points ``(q,)`` where no vertex is known again.
+        Of each vertex ``(n,)``, NaN if unobserved; without correspondence of each point ``(q,)``.
         """
         if self.fitted is None or self.observation is None:
             return None
@@ -181,7 +182,7 @@ class StudyResult:
 
     @property
     def distance_to_truth(self) -> FloatArray | None:
-        """As ``distance``, to the positions without errors; also of vertices that are not seen."""
+        """Distance (mm) of every vertex ``(n,)`` from its position without observation error."""
         if self.fitted is None or self.truth is None:
             return None
         return np.linalg.norm(self.fitted[-1] - self.truth.positions[-1], axis=1)
@@ -194,7 +195,7 @@ def expected_intervals(
     before: FloatArray,
     after: FloatArray,
 ) -> list[dict[str, Any]]:
-    """The 95 % interval of each unknown about its generic value, before and after an estimation.
+    """The 95 % interval of each unknown around its generic value, before and after an estimation.
 
     Parameters
     ----------
@@ -208,7 +209,7 @@ def expected_intervals(
     -------
     list of dict
         ``name``, ``unit``, ``generic``, ``low_before``, ``high_before``, ``low``, ``high``, and
-        ``width``: that of the interval in filter coordinates, after over before.
+        ``width``: ``after / before``.
     """
     z, reach = transform.forward(generic), float(ndtri(0.975))
     columns = {"name": list(names), "unit": list(map(unit_of, names)), "generic": generic.tolist()}
@@ -224,7 +225,7 @@ def estimate(
 ) -> StudyResult:
     """Estimate the parameters of a problem from an observation.
 
-    Numerical failure is a result with its reason; only inadmissible input raises.
+    A numerical failure is a result with its reason; only inadmissible input raises.
     """
     started = time.perf_counter()
     filtered = problem.filter(
@@ -240,7 +241,7 @@ def estimate(
     if filtered.prediction is not None:
         aux = filtered.prediction.aux
         fitted = aux if isinstance(aux, np.ndarray) else None
-        # What is estimated near zero has its prior for a size.
+        # Parameters near zero are scaled by their prior.
         bound = identifiability(
             filtered.prediction.jacobian,
             observation.R if filtered.learned is None else filtered.learned.noise,

@@ -1,7 +1,6 @@
-"""Shapes and fields of one case as its run stored them, turned so that the atrium is above.
+"""Shapes and fields of one case as its run stored them, rotated so that the atrium is on top.
 
-Everything that is drawn of a case is read here once. What a run did not store is None, so that a
-report can say so instead of drawing something else.
+All drawings of a case read them here. Arrays that a run did not store are None.
 """
 
 from __future__ import annotations
@@ -37,33 +36,33 @@ SHAPES: Mapping[str, tuple[type, tuple[str | int, ...]]] = {
     **dict.fromkeys(("observed", "generic", "fitted"), (np.float64, ("f", "n", 3))),
     **dict.fromkeys(("distance_generic", "distance_fitted"), (np.float64, ("f", "n"))),
 }
-"""Type and shape of each array; equal letters are equal lengths, and f is the number of frames."""
+"""Type and shape of each array; equal letters are equal lengths, f is the number of frames."""
 INDEXED = {"triangles": "n", "annulus": "n", "free_edge": "n", "chord_insertion": "n",
            "chord_tip": "t"}  # fmt: skip
-"""Arrays of indices, and below which length they are."""
+"""Index arrays -> the length that bounds them."""
 TURNED = ("rest", "tips", "observed", "generic", "fitted")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseFields:
-    """A valve at rest, and how it was seen and predicted in ``f`` further frames.
+    """A valve at rest, with its observed and predicted shapes in ``f`` further frames.
 
     Attributes
     ----------
     triangles, region, rest, annulus, free_edge, seen, tips, chord_tip, chord_insertion : ndarray
-        As in `SHAPES`: of the open valve in the reference frame (mm), loops in order, whether the
-        filter was shown a frame, papillary tips in the reference frame and then in the others (mm),
-        and the tip and the vertex at which each chord begins and ends.
+        With the shapes of `SHAPES`: of the open valve in the reference frame (mm), loops in order,
+        whether the filter received a frame, papillary tips in the reference frame and then in the
+        others (mm), and the tip and the vertex of each chord.
     frames : tuple of str
-        ``f`` names, the reference frame not among them.
+        ``f`` names, without the reference frame.
     observed, generic, fitted : ndarray or None
-        ``(f, n, 3)`` mm; NaN where a vertex was not seen.
+        ``(f, n, 3)`` mm; NaN for unobserved vertices.
     observed_points : mapping
-        ``(q, 3)`` mm for a frame that does not correspond to the reference frame.
+        ``(q, 3)`` mm for a frame without correspondence to the reference frame.
     distance_generic, distance_fitted : ndarray or None
-        ``(f, n)`` mm from what was observed; NaN where nothing was.
+        ``(f, n)`` mm from the observation; NaN for unobserved vertices.
     reach_mm : float or None
-        Distance of midsurfaces within which leaflets touch.
+        Distance of midsurfaces below which leaflets touch.
     """
 
     triangles: IntArray
@@ -92,7 +91,7 @@ class CaseFields:
         for name, (_, letters) in SHAPES.items():
             if (array := getattr(self, name)) is None:
                 continue
-            # Letters that were not met before stand for what is here.
+            # The first array with a letter defines its length.
             lengths = dict(zip(letters, array.shape, strict=False)) | lengths
             expected = tuple(lengths.get(letter) for letter in letters)
             if array.shape != expected:
@@ -104,7 +103,7 @@ class CaseFields:
 
     @property
     def closed(self) -> int:
-        """The first frame that the filter was shown, or the first of all."""
+        """Index of the first frame that the filter received, else of the first frame."""
         return int(np.argmax(self.seen))
 
     @property
@@ -115,12 +114,12 @@ class CaseFields:
         return result
 
     def chords(self, points: FloatArray, frame: int) -> FloatArray:
-        """Ends ``(c, 2, 3)`` of the chordae; ``frame`` counts the reference frame as 0."""
+        """Ends ``(c, 2, 3)`` of the chordae; frame 0 is the reference frame."""
         return np.stack([self.tips[frame][self.chord_tip], points[self.chord_insertion]], axis=1)
 
 
 def as_stored(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Arrays as a run stores them: indices as int32, positions in single precision."""
+    """Arrays in the types that runs store: int32 indices, single precision positions."""
     stored = {name: np.asarray(values) for name, values in arrays.items()}
     for name, values in stored.items():
         if values.dtype.kind == "i":
@@ -131,7 +130,7 @@ def as_stored(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
 
 
 def valve_fields(valve: Valve, frames: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Arrays of a valve for `case_fields`, to which shapes in frames that were seen are added."""
+    """Arrays of a valve for `case_fields`; callers add the shapes of the frames."""
     surface = valve.surface
     return as_stored(
         {
@@ -148,20 +147,20 @@ def valve_fields(valve: Valve, frames: Sequence[str]) -> dict[str, NDArray[Any]]
 
 
 def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> CaseFields:
-    """The fields of a case, turned: z to the atrium, the first leaflet towards positive y.
+    """The fields of a case, rotated: z to the atrium, the first leaflet towards positive y.
 
     Parameters
     ----------
     arrays : mapping or Path
         At least ``triangles``, ``region``, ``rest``, ``annulus``, ``frames`` and ``seen``; the
-        others as in `CaseFields`, and ``observed_points_<frame>``; or the ``.npz`` file of them.
+        others as in `CaseFields`, and ``observed_points_<frame>``. Or their ``.npz`` file.
     turned : bool
-        Otherwise it is left in the axes of the case.
+        False: keep the axes of the case.
 
     Raises
     ------
     InputError
-        If they cannot be read, one of those is missing, or arrays do not fit each other.
+        If arrays cannot be read, are missing, or do not fit each other.
     """
     where = "arrays"
     try:
@@ -182,7 +181,14 @@ def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> Cas
         }
         reach = float(arrays["reach_mm"]) if "reach_mm" in arrays else None
         fields = CaseFields(frames=frames, observed_points=points, reach_mm=reach, **values)
-        return _turned(fields) if turned else fields
+        if not turned:
+            return fields
+        middle, axes = turn_of(
+            fields.rest, fields.annulus, fields.triangles, fields.region, fields.tips[0]
+        )
+        shapes = {name: (values[name] - middle) @ axes for name in TURNED if name in values}
+        points = {name: (array - middle) @ axes for name, array in points.items()}
+        return replace(fields, observed_points=points, **shapes)
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise InputError(f"{where}: no fields of a case ({one_line(error, 200)})") from error
 
@@ -190,9 +196,9 @@ def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> Cas
 def turn_of(
     rest: FloatArray, annulus: IntArray, triangles: IntArray, region: IntArray, tips: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Middle ``(3,)`` and axes ``(3, 3)`` of a valve: annulus horizontal, tips below.
+    """Centre ``(3,)`` and axes ``(3, 3)`` of a valve: annulus horizontal, tips below it.
 
-    The first leaflet lies towards positive y; ``(points - middle) @ axes`` turns.
+    ``(points - centre) @ axes`` rotates; the first leaflet then lies towards positive y.
     """
     ring = rest[annulus]
     middle = ring.mean(axis=0)
@@ -200,22 +206,7 @@ def turn_of(
     below = tips if len(tips) else rest
     if (below.mean(axis=0) - middle) @ up > 0:
         up = -up
-    first = np.unique(triangles[region == region.min()])
-    front = rest[first].mean(axis=0) - middle
+    front = rest[np.unique(triangles[region == region.min()])].mean(axis=0) - middle
     front -= (front @ up) * up
     front /= np.linalg.norm(front)
     return middle, np.stack([np.cross(front, up), front, up], axis=1)
-
-
-def _turned(fields: CaseFields) -> CaseFields:
-    """The same valve about the middle of its annulus."""
-    middle, axes = turn_of(
-        fields.rest, fields.annulus, fields.triangles, fields.region, fields.tips[0]
-    )
-    shapes: dict[str, Any] = {
-        name: (array - middle) @ axes
-        for name in TURNED
-        if (array := getattr(fields, name)) is not None
-    }
-    points = {name: (array - middle) @ axes for name, array in fields.observed_points.items()}
-    return replace(fields, observed_points=points, **shapes)

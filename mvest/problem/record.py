@@ -1,14 +1,13 @@
-"""The record of one estimate: a run writes it, tables read it, MLflow logs it, sweeps join it.
+"""The record of one estimate: runs write it; tables, MLflow and sweeps read it.
 
-There is no second form of these numbers. Plain data go in and out by pydantic
-(``record.model_dump(mode="json")``, ``EstimateRecord.model_validate(data)``); a number that is
-infinite or unknown is None, as JSON has neither.
+Pydantic converts it (``record.model_dump(mode="json")``, ``EstimateRecord.model_validate(data)``).
+Infinite and unknown numbers are None, since JSON has neither.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -28,11 +27,11 @@ Numbers = tuple[float | None, ...]
 Row = Mapping[str, Any]
 
 LEVEL = 0.95
-"""Probability that an interval holds."""
+"""Probability of the intervals."""
 
 
 class Frozen(BaseModel):
-    """A part of a record: immutable, and without fields that it does not name."""
+    """Part of a record: immutable, with no extra fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -46,13 +45,7 @@ class Spread(Frozen):
 
     @classmethod
     def of(cls, values: FloatArray) -> Spread:
-        """Of the finite values: a vertex that is not seen has no distance.
-
-        Raises
-        ------
-        InputError
-            If no value is finite.
-        """
+        """Of the finite values; InputError if there is none."""
         known = values[np.isfinite(values)]
         if not known.size:
             raise InputError("a field of distances without a single value")
@@ -62,31 +55,25 @@ class Spread(Frozen):
         return f"{self.mean:.2f} ± {self.std:.2f}"
 
 
-def spread(values: FloatArray | None) -> Spread | None:
-    """The same; None where no value is finite."""
-    return None if values is None or not np.isfinite(values).any() else Spread.of(values)
-
-
 class Unknown(Frozen):
     """One unknown before and after the estimation, in its unit.
 
     Attributes
     ----------
     name, label, unit : str
-        ``E_f.anterior``; what a reader calls it; empty for a factor.
+        For example ``E_f.anterior``, its readable name, and its unit (empty for a factor).
     kind : {"modulus", "nuisance", "derived", "quantity"}
-        A derived modulus follows from an estimated one through a fixed ratio; a quantity is a ratio
-        of moduli or a strain (%).
+        A derived modulus follows from an estimated one by a fixed ratio; a quantity is a ratio of
+        moduli or a strain (%).
     treatment : {"estimated", "fixed"}
     prior_mean, prior_std : float or None
     estimate, std : float or None
-        None where the run did not get so far.
     low, high : float or None
         Ends of the 95 % interval.
     bound : float or None
         Cramér-Rao standard deviation of the data alone; None if they do not determine it.
     truth : float or None
-        Known for simulated valves; never known to the estimator.
+        Of simulated valves; added after the estimation.
     """
 
     name: str
@@ -110,12 +97,12 @@ class Unknown(Frozen):
 
     @property
     def is_modulus(self) -> bool:
-        """Whether it is an estimated modulus of a leaflet."""
+        """Whether it is the estimated modulus of a leaflet."""
         return self.kind == "modulus"
 
     @property
     def is_positive(self) -> bool:
-        """Whether its interval is that of its logarithm."""
+        """Whether its logarithm is estimated."""
         if self.kind == "quantity":
             return self.unit != "%"
         return self.name not in REGISTRATION and is_positive(self.name)
@@ -129,22 +116,22 @@ class Unknown(Frozen):
 
     @property
     def inside(self) -> bool | None:
-        """Whether the interval contains the truth; None where one of them is not known."""
+        """Whether the interval contains the truth; None if one of them is unknown."""
         if self.low is None or self.high is None or self.truth is None:
             return None
         return self.low <= self.truth <= self.high
 
 
 class FrameFit(Frozen):
-    """Distances (mm) of the models from an observed frame, and from a simulated valve's true one.
+    """Distances (mm) of the models from an observed frame and, if simulated, from the true one.
 
     Attributes
     ----------
     frame : str
     seen : bool
-        Whether the filter was given this frame.
+        Whether the filter received this frame.
     generic, registered, personalised : Spread
-        Models as in `mvest.personalisation.result.FrameDistance`.
+        Models as in `mvest.personalisation.result.FrameComparison`.
     generic_to_truth, registered_to_truth, personalised_to_truth : Spread or None
     """
 
@@ -159,26 +146,26 @@ class FrameFit(Frozen):
 
 
 class EstimateRecord(Frozen):
-    """One estimate, or the reason why there is none.
+    """One estimate, or the reason for its absence.
 
     Attributes
     ----------
     case : str
         Name of the case; empty for a synthetic study.
     seed : int or None
-        Of the errors of the observation.
+        Of the observation errors.
     simulated : bool or None
         Whether the observation is stated as simulated.
     status : {"converged", "failed"}
     reason, detail : str
         Why the estimation ended.
     verdict : Verdict or None
-        How far the estimate may be believed; None where it was not judged.
+        None if nothing was judged.
     unknowns : tuple of Unknown
     correlation : (p, p)
-        Of the errors of the unknowns in filter coordinates; empty if not kept.
+        Posterior correlation of the unknowns in filter coordinates; may be empty.
     distance_mm, distance_to_truth_mm : Spread or None
-        Of the fitted vertices of the last observed frame from the observed and the true ones.
+        From the fitted vertices of the last observed frame to the observed and the true ones.
     frames : tuple of FrameFit
     innovation : InnovationSummary or None
     condition_number : float or None
@@ -186,17 +173,17 @@ class EstimateRecord(Frozen):
     flat : tuple of str
         Combinations of unknowns that the data hardly determine.
     confounded : tuple of TradeOff
-        Parameters that the data hardly tell apart.
+        Parameters that the data hardly distinguish.
     iterations, forward_solves : int or None
     iterates, iterate_std : (i, p)
     objective : (i,)
     seconds : float or None
         Wall-clock time of the estimation.
     alternatives : mapping
-        Name -> another estimate from the same data: ``moduli_only`` with everything else taken as
-        known, ``paper`` as the paper does it.
+        Name -> another estimate from the same data: ``moduli_only`` with all nuisances fixed,
+        ``paper`` by the paper's method.
     details : mapping
-        Name -> rows of plain data, for reports (see `mvest.personalisation.record`).
+        Name -> rows of plain data for reports (see `mvest.personalisation.record`).
     """
 
     case: str = ""
@@ -231,7 +218,7 @@ class EstimateRecord(Frozen):
 
     @property
     def is_stated(self) -> bool:
-        """Whether its numbers may be stated: the verdict is not that there is no estimate."""
+        """Whether its numbers may be stated: it converged and the verdict is not ``none``."""
         return self.converged and (self.verdict is None or self.verdict.trust != NONE)
 
     @property
@@ -241,28 +228,19 @@ class EstimateRecord(Frozen):
 
     @property
     def parameters(self) -> tuple[Unknown, ...]:
-        """The unknowns of the filter, without the moduli that follow from them."""
+        """The unknowns of the filter, without derived moduli."""
         return tuple(unknown for unknown in self.unknowns if unknown.kind != "derived")
 
     def unknown(self, name: str) -> Unknown:
-        """The unknown of that name.
-
-        Raises
-        ------
-        KeyError
-            If there is none.
-        """
-        for unknown in self.unknowns:
-            if unknown.name == name:
-                return unknown
-        raise KeyError(name)
+        """The unknown of that name; KeyError if there is none."""
+        return {unknown.name: unknown for unknown in self.unknowns}[name]
 
     def detail_rows(self, name: str) -> tuple[Row, ...]:
-        """The rows of a detail; none where it was not computed."""
+        """The rows of a detail; empty if it was not computed."""
         return self.details.get(name, ())
 
     def without_details(self, *kept: str) -> EstimateRecord:
-        """The same without how it came about: iterates, correlations, details but those kept."""
+        """A copy without iterates, correlations, trade-offs and details, except those ``kept``."""
         nothing: dict[str, Any] = dict.fromkeys(
             ("correlation", "iterates", "iterate_std", "objective", "flat", "confounded"), ()
         )
@@ -271,14 +249,12 @@ class EstimateRecord(Frozen):
         return self.model_copy(update={**nothing, "details": details, "alternatives": others})
 
     def with_truth(self, truth: Mapping[str, float]) -> EstimateRecord:
-        """The same with the true values of its unknowns, for a simulated valve.
-
-        Derived moduli, and the alternatives, are given theirs as well.
+        """A copy with true values, also for derived moduli and the alternatives.
 
         Parameters
         ----------
         truth : mapping
-            Name -> value; an unknown that it does not name keeps what it has.
+            Name -> value; unknowns without an entry stay as they are.
         """
         known = dict(truth)
         for unknown in self.unknowns:
@@ -287,20 +263,19 @@ class EstimateRecord(Frozen):
                 fibre = self.unknown(own).estimate
                 if fibre:
                     known[unknown.name] = unknown.estimate / fibre * truth[own]
-        return self.model_copy(
-            update={
-                "unknowns": tuple(
-                    one.model_copy(update={"truth": known.get(one.name, one.truth)})
-                    for one in self.unknowns
-                ),
-                "alternatives": {
-                    name: other.with_truth(truth) for name, other in self.alternatives.items()
-                },
-            }
+        unknowns = tuple(
+            one.model_copy(update={"truth": known.get(one.name, one.truth)})
+            for one in self.unknowns
         )
+        others = {name: other.with_truth(truth) for name, other in self.alternatives.items()}
+        return self.model_copy(update={"unknowns": unknowns, "alternatives": others})
 
     def rows(self) -> list[dict[str, Any]]:
-        """A row for each unknown, with what is true of the whole estimate in each: a tidy table."""
+        """A tidy table: one row for each unknown, with the columns of the whole estimate."""
+
+        def columns(name: str, part: Spread | None) -> dict[str, float]:
+            return {f"{name}_{k}": v for k, v in part or ()}
+
         whole = {
             "case": self.case,
             "seed": self.seed,
@@ -308,8 +283,8 @@ class EstimateRecord(Frozen):
             "status": self.status,
             "reason": self.reason,
             "verdict": None if self.verdict is None else self.verdict.trust,
-            **{f"distance_{k}": v for k, v in _plain(self.distance_mm).items()},
-            **{f"distance_to_truth_{k}": v for k, v in _plain(self.distance_to_truth_mm).items()},
+            **columns("distance", self.distance_mm),
+            **columns("distance_to_truth", self.distance_to_truth_mm),
             "nis": None if self.innovation is None else self.innovation.nis,
             "iterations": self.iterations,
             "forward_solves": self.forward_solves,
@@ -328,24 +303,35 @@ class EstimateRecord(Frozen):
         return rows or [whole]
 
 
-def _plain(part: Spread | None) -> dict[str, float]:
-    return {} if part is None else part.model_dump()
-
-
 def record_of(
     result: StudyResult, *, seed: int | None = None, case: str = "", simulated: bool | None = None
 ) -> EstimateRecord:
-    """The record of a result; of a failed one the reason.
+    """The record of a result, or of the reason for its failure.
 
-    Parameters
-    ----------
-    result : StudyResult
-        Compared with its truth, if that may be known (`StudyResult.against`).
-    seed : int or None
-    case : str
-    simulated : bool or None
+    Its truth is recorded if the result has one (`StudyResult.against`). ``seed``, ``case`` and
+    ``simulated`` are as in `EstimateRecord`.
     """
     filtered, known = result.filtered, result.identifiability
+    about: dict[str, Any] = {}
+    if filtered is not None:
+        about |= {
+            "innovation": filtered.innovation,
+            "iterations": filtered.iterations,
+            "forward_solves": filtered.forward_solves,
+            "iterates": tuple(map(_numbers, filtered.iterates)),
+            "iterate_std": tuple(map(_numbers, filtered.iterate_std)),
+            "objective": _numbers(filtered.objective),
+        }
+    if known is not None:
+        about |= {
+            "condition_number": finite(known.condition_number),
+            "flat": tuple(known.flat()),
+            "confounded": known.confounded(),
+        }
+    for name in ("distance", "distance_to_truth"):
+        values = getattr(result, name)
+        if values is not None and np.isfinite(values).any():
+            about[f"{name}_mm"] = Spread.of(values)
     return EstimateRecord(
         case=case,
         seed=seed,
@@ -354,18 +340,8 @@ def record_of(
         reason=result.reason,
         detail=result.detail,
         unknowns=_unknowns(result),
-        distance_mm=spread(result.distance),
-        distance_to_truth_mm=spread(result.distance_to_truth),
-        innovation=None if filtered is None else filtered.innovation,
-        condition_number=None if known is None else finite(known.condition_number),
-        flat=() if known is None else tuple(known.flat()),
-        confounded=() if known is None else known.confounded(),
-        iterations=None if filtered is None else filtered.iterations,
-        forward_solves=None if filtered is None else filtered.forward_solves,
-        iterates=() if filtered is None else _rows(filtered.iterates),
-        iterate_std=() if filtered is None else _rows(filtered.iterate_std),
-        objective=() if filtered is None else _numbers(filtered.objective),
         seconds=result.seconds,
+        **about,
     )
 
 
@@ -378,12 +354,8 @@ def _numbers(values: ArrayLike) -> Numbers:
     return tuple(map(finite, np.asarray(values, dtype=np.float64).tolist()))
 
 
-def _rows(values: ArrayLike) -> tuple[Numbers, ...]:
-    return tuple(map(_numbers, np.asarray(values)))
-
-
 def _unknowns(result: StudyResult) -> tuple[Unknown, ...]:
-    """The parameters of a result, and the moduli that follow through fixed ratios."""
+    """The parameters of a result and the derived moduli."""
     filtered = result.filtered
     columns: dict[str, FloatArray | None] = {"estimate": result.estimate, "std": result.std}
     if filtered is not None:
@@ -393,33 +365,21 @@ def _unknowns(result: StudyResult) -> tuple[Unknown, ...]:
     columns["bound"] = None if result.identifiability is None else result.identifiability.std
     columns["truth"] = None if result.truth is None else result.truth.values
     known = {key: values for key, values in columns.items() if values is not None}
-    own = [
-        Unknown(
-            name=name,
-            label=label_of(name),
-            unit=unit_of(name),
-            kind="modulus" if name.startswith("E_f.") else "nuisance",
-        ).model_copy(update={key: finite(values[k]) for key, values in known.items()})
-        for k, name in enumerate(result.parameters)
-    ]
-    return (*own, *_derived_moduli(result, own))
-
-
-def _derived_moduli(result: StudyResult, unknowns: Sequence[Unknown]) -> list[Unknown]:
-    """The moduli that follow from the estimated ones through the fixed ratios of the tissue."""
-    rows = []
-    for own in unknowns:
-        if not (own.is_modulus and own.region in result.tissue and own.estimate):
+    own: list[Unknown] = []
+    derived: list[Unknown] = []
+    for k, name in enumerate(result.parameters):
+        numbers: dict[str, Any] = {key: finite(values[k]) for key, values in known.items()}
+        kind: Any = "modulus" if name.startswith("E_f.") else "nuisance"
+        one = Unknown(name=name, label=label_of(name), unit=unit_of(name), kind=kind, **numbers)
+        own.append(one)
+        if not (one.is_modulus and one.region in result.tissue and one.estimate):
             continue
-        unit = result.tissue[own.region].material(1.0)
-        for name, share in (("E_perp", unit.E_p), ("G", unit.G)):
-            values = {key: getattr(own, key) for key in ("estimate", "std", "low", "high", "truth")}
-            scaled = {key: v if v is None else share * v for key, v in values.items()}
-            about = {
-                "name": f"{name}.{own.region}",
-                "label": f"{name} {own.region}",
-                "kind": "derived",
+        unit = result.tissue[one.region].material(1.0)
+        for other, share in (("E_perp", unit.E_p), ("G", unit.G)):
+            scaled: dict[str, Any] = {
+                key: None if (value := numbers.get(key)) is None else share * value
+                for key in ("estimate", "std", "low", "high", "truth")
             }
-            nothing = dict.fromkeys(("prior_mean", "prior_std", "bound"))
-            rows.append(own.model_copy(update=about | scaled | nothing))
-    return rows
+            name, label = f"{other}.{one.region}", f"{other} {one.region}"
+            derived.append(Unknown(name=name, label=label, unit=one.unit, kind="derived", **scaled))
+    return (*own, *derived)

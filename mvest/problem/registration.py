@@ -1,9 +1,8 @@
-"""A rigid displacement between the axes of the model and those of what was seen.
+"""Parameters besides those of the closure, above all a rigid displacement of the observed valve.
 
-The model is bounded by the annulus and the papillary tips as they were tracked. If the leaflets of
-the later frames were seen displaced against these (by an error of tracking common to all their
-points), every modulus is fitted to that displacement. So it is a parameter: predicted closed frames
-are turned and shifted before they are compared.
+The model is bounded by the tracked annulus and papillary tips. A tracking error common to all later
+points of the leaflets displaces them against this boundary and biases every modulus. So it is a
+parameter: predicted closed frames are rotated and shifted before the comparison.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from mvest.typing import FloatArray
 REGISTRATION = ("shift.x", "shift.y", "shift.z", "turn.x", "turn.y", "turn.z")
 """Parameters of a displacement: shifts in mm, and a rotation vector in degrees."""
 UNITS = {"shift": "mm", "turn": "degrees"}
+LARGEST = {"mm": 1000, "degrees": 360}
 LABELS = {
     "pressure_scale": "pressure (factor)",
     OFFSET: "offset of pressures",
@@ -33,18 +33,17 @@ LABELS = {
     "stiffening": "stiffening",
     "prestretch": "stretch when seen open (factor)",
 }
-"""What a reader calls an unknown."""
-LARGEST = {"mm": 1000, "degrees": 360}
+"""Readable names of unknowns."""
 
 
 def registration_of(names: tuple[str, ...], m: FloatArray) -> FloatArray:
-    """Shift and turn ``(6,)`` out of parameters ``m (p,)``; zero where ``names`` lacks one."""
+    """Shift and rotation ``(6,)`` among parameters ``m (p,)``; zero for those not in ``names``."""
     values = dict(zip(names, map(float, m), strict=True))
     return np.array([values.get(name, 0.0) for name in REGISTRATION])
 
 
 def unit_of(name: str) -> str:
-    """Unit of a parameter of a closure or of a displacement; empty for what has none."""
+    """Unit of a parameter; empty if it has none."""
     if name in REGISTRATION:
         return UNITS[name.partition(".")[0]]
     if is_frame_pressure(name):
@@ -54,7 +53,7 @@ def unit_of(name: str) -> str:
 
 
 def label_of(name: str) -> str:
-    """What a reader calls an unknown: ``E_f anterior`` for ``E_f.anterior``."""
+    """Readable name of an unknown: ``E_f anterior`` for ``E_f.anterior``."""
     kind, _, part = name.partition(".")
     if kind in ("E_f", "E_perp", "G"):
         return f"{kind} {part}"
@@ -66,7 +65,7 @@ def label_of(name: str) -> str:
 
 
 def range_of(name: str) -> Within | None:
-    """The admissible range of a parameter of a closure or of a displacement; None for others."""
+    """The admissible range of a parameter; None for unknown names."""
     if name in REGISTRATION:
         unit = unit_of(name)
         return within(-LARGEST[unit], LARGEST[unit], unit, "")
@@ -75,14 +74,9 @@ def range_of(name: str) -> Within | None:
 
 
 def displace(points: FloatArray, registration: FloatArray, centre: FloatArray) -> FloatArray:
-    """Points ``(..., 3)`` mm turned about ``centre (3,)`` and shifted.
+    """Points ``(..., 3)`` mm rotated about ``centre (3,)`` and shifted.
 
-    Parameters
-    ----------
-    points, centre : ndarray
-        mm.
-    registration : ndarray
-        ``(6,)`` shift in mm and rotation vector in degrees (its length is the angle).
+    ``registration (6,)`` is a shift in mm and a rotation vector in degrees (length: the angle).
     """
     turn = Rotation.from_rotvec(registration[3:], degrees=True).as_matrix()
     return np.asarray((points - centre) @ turn.T + centre + registration[:3])
@@ -92,38 +86,33 @@ def _turn_derivatives(vector: FloatArray) -> FloatArray:
     """Derivatives ``(3, 3, 3)`` of the rotation matrix by its rotation vector (rad), k first.
 
     Gallego and Yezzi 2015, J. Math. Imaging Vis. 51:378, eq. 9:
-    dR/dv_k = [v_k v + v x (I - R) e_k]_x R / |v|^2, and [e_k]_x for no rotation.
+    dR/dv_k = [v_k v + v x (I - R) e_k]_x R / |v|^2, and [e_k]_x without rotation.
     """
-    R = Rotation.from_rotvec(vector).as_matrix()
-    squared = float(vector @ vector)
-    out = np.empty((3, 3, 3))
-    for k, unit in enumerate(np.eye(3)):
-        if squared < 1e-16:
-            out[k] = _cross(unit)
-        else:
-            axis = vector[k] * vector + np.cross(vector, (np.eye(3) - R)[:, k])
-            out[k] = _cross(axis) @ R / squared
-    return out
+    R, squared = Rotation.from_rotvec(vector).as_matrix(), float(vector @ vector)
 
+    def cross(v: FloatArray) -> FloatArray:
+        return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
-def _cross(v: FloatArray) -> FloatArray:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    if squared < 1e-16:
+        return np.stack([cross(unit) for unit in np.eye(3)])
+    axes = [vector[k] * vector + np.cross(vector, (np.eye(3) - R)[:, k]) for k in range(3)]
+    return np.stack([cross(axis) @ R / squared for axis in axes])
 
 
 class RegisteredModel:
-    """A closure of which every frame but the open one is displaced before it is seen.
+    """A closure that displaces all predicted frames except the open one.
 
     Parameters
     ----------
     model : ClosureModel or FramesModel
         Predicts the open frame and closed ones.
     names : tuple of str, (p,)
-        Those of the model, and some of ``REGISTRATION``, in any order.
+        Those of the model in its order, mixed with some of ``REGISTRATION``.
 
     Raises
     ------
     InputError
-        If a parameter of the model is missing or an unknown one is named.
+        If the names do not match.
     """
 
     def __init__(self, model: ClosureModel | FramesModel, names: tuple[str, ...]) -> None:
@@ -142,29 +131,32 @@ class RegisteredModel:
 
     @property
     def closed(self) -> ClosedState | None:
-        """Where the next prediction would start from."""
+        """Starting state of the next prediction."""
         return self.model.closed
 
     def restart(self, closed: ClosedState | None) -> None:
-        """Forget everything but where to start from."""
+        """Reset the model to a starting state."""
         self._last = None
         self.model.restart(closed)
 
     def mechanical(self, m: FloatArray) -> FloatArray:
-        """The parameters of the closure out of all."""
+        """The parameters of the closure among all parameters ``m (p,)``."""
         own = self.own(m)
         return self.model.of_closure(own) if isinstance(self.model, FramesModel) else own
 
     def own(self, m: FloatArray) -> FloatArray:
-        """All parameters but those of the displacement."""
+        """All parameters except those of the displacement."""
         return np.asarray(m, dtype=np.float64)[self._own]
 
     def seen(self, points: FloatArray, m: FloatArray) -> FloatArray:
-        """Positions ``(..., 3)`` mm of the closed valve as parameters ``m`` say they are seen."""
+        """Positions ``(..., 3)`` mm of the closed valve, displaced as parameters ``m`` say."""
         return displace(points, registration_of(self.names, m), self.centre)
 
     def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict, as an ``ObservationModel`` does; only another displacement closes nothing."""
+        """Predict; the valve is closed anew only if other parameters than the displacement change.
+
+        Parameters and prediction are those of an ``ObservationModel``.
+        """
         own = self.own(m)
         if self._last is None or not np.array_equal(self._last[0], own):
             self._last = own, self.model(own)
@@ -189,7 +181,5 @@ class RegisteredModel:
             elif kind == "turn":
                 by_radian = (closed - self.centre) @ turns[i].T
                 jacobian[start:, k] = np.deg2rad(by_radian).ravel()
-        seen = displace(closed, registration, self.centre)
-        return replace(
-            prediction, y=np.concatenate([prediction.y[:start], seen.ravel()]), jacobian=jacobian
-        )
+        y = np.concatenate([prediction.y[:start], self.seen(closed, m).ravel()])
+        return replace(prediction, y=y, jacobian=jacobian)

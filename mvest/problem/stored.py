@@ -1,7 +1,6 @@
-"""Caches of what studies share: simulations, cycles, virtual patients, samples.
+"""Disk caches shared by studies: simulations, cycles, virtual patients, samples.
 
-A cache entry is named by the values that it was made from and by the code that made it
-(:mod:`mvest.cache`), is made once, and appears whole or not at all.
+The key of a cache entry combines its input values and the code that made it (:mod:`mvest.cache`).
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ from mvest.typing import FloatArray
 T = TypeVar("T")
 
 DIGITS = 32
-"""Of a key."""
+"""Length of a key."""
 
 
 def key_of(described: Mapping[str, Any], made_by: tuple[Any, ...]) -> str:
-    """Key of what is made from plain values by modules, functions or classes.
+    """Key of plain input values and the modules, functions or classes that use them.
 
     Raises
     ------
     InputError
-        If a value has no JSON form, or something is of another package.
+        If a value has no JSON form, or code belongs to another package.
     """
     return config_hash({"made_from": described, "source": source_key(*made_by)})[:DIGITS]
 
@@ -43,16 +42,16 @@ def entry_of(
     read: Callable[[Path], T],
     name: str = "{key}.npz",
 ) -> Entry[T]:
-    """The cache entry of what is made from ``described`` by ``made_by``.
+    """The cache entry of what ``made_by`` makes from ``described``.
 
     Parameters
     ----------
     folder : Path
-        Made when something is cached.
+        Created with the first entry.
     described : mapping
-        Plain values: all that decides what is made, but the code.
+        Plain values: everything that decides the content, except the code.
     made_by : tuple
-        Modules, functions or classes that make it and write it; what they import counts too.
+        Modules, functions or classes that make and write it; their imports count too.
     read : callable
         Reads a path, or refuses it.
     name : str
@@ -63,14 +62,14 @@ def entry_of(
 
 @dataclass(frozen=True, slots=True)
 class StoredModel:
-    """A model whose converged predictions are cached on disk, without their derivatives.
+    """A model with a disk cache of its converged predictions, without derivatives.
 
     Attributes
     ----------
     model : ObservationModel
     folder : Path
     key : str
-        See :func:`key_of`; the parameters are added to it.
+        From :func:`key_of`; the parameters are added to it.
     """
 
     model: ObservationModel
@@ -78,7 +77,7 @@ class StoredModel:
     key: str
 
     def __call__(self, m: FloatArray, /) -> Prediction:
-        """Prediction at ``m (p,)``, read from disk if it is there; its Jacobian is then zero.
+        """Prediction at ``m (p,)``; its Jacobian is zero if it was read from disk.
 
         Raises
         ------
@@ -100,17 +99,16 @@ class StoredModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrapolated:
-    """Predictions that are linear in the mesh size, extrapolated to zero mesh size.
+    """Predictions extrapolated to zero mesh size, assuming an error linear in the mesh size.
 
-    Closed valves of quadratic tetrahedra have nearly this order (Richardson 1911, Phil. Trans. R.
-    Soc. A 210:307, with order one): leaflets bend sharply where they touch, and chordae and annulus
-    pull at lines.
+    Richardson 1911, Phil. Trans. R. Soc. A 210:307. Closed valves of quadratic tetrahedra converge
+    with nearly order one: leaflets bend sharply at contact, and chordae and annulus pull at lines.
 
     Attributes
     ----------
     fine, coarse : StoredModel
     share : float
-        Size of the finer mesh's cells over that of the coarser one's.
+        Cell size of the fine mesh over that of the coarse one.
     """
 
     fine: StoredModel
@@ -122,11 +120,9 @@ class Extrapolated:
         fine, coarse = self.fine(m), self.coarse(m)
         if not (fine.converged and coarse.converged):
             return coarse if fine.converged else fine
-        return Prediction(fine.y + self._correction(fine, coarse), fine.jacobian)
+        return Prediction(fine.y + self.correction(m), fine.jacobian)
 
     def correction(self, m: FloatArray) -> FloatArray:
-        """What the extrapolation adds to the finer mesh's prediction, ``(n,)`` mm."""
-        return self._correction(self.fine(m), self.coarse(m))
-
-    def _correction(self, fine: Prediction, coarse: Prediction) -> FloatArray:
-        return np.asarray(self.share / (1 - self.share) * (fine.y - coarse.y))
+        """Difference ``(n,)`` mm of the extrapolation from the fine mesh's prediction."""
+        difference = self.fine(m).y - self.coarse(m).y
+        return np.asarray(self.share / (1 - self.share) * difference)

@@ -1,4 +1,4 @@
-"""Observations that are made from a known truth, and that truth, which no filter is given."""
+"""Synthetic observations made from a known truth. Filters never receive the truth."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from mvest.typing import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What a synthetic observation was made from; no filter is given one.
+    """The origin of a synthetic observation.
 
     Attributes
     ----------
     parameters : tuple of str, (p,)
     values : (p,) in the units of the parameters
     positions : (f, n, 3) mm
-        The observed frames before noise was added.
+        The observed frames without noise.
     """
 
     parameters: tuple[str, ...]
@@ -33,7 +33,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwinData:
-    """A synthetic observation with the truth behind it, or the reason why there is none."""
+    """A synthetic observation and its truth, or the reason for their absence."""
 
     observation: Observation | None
     truth: Truth | None
@@ -51,29 +51,24 @@ def simulate_observation(
     errors: Sequence[ObservationError] = (),
     rng: np.random.Generator,
 ) -> TwinData:
-    """Make a synthetic observation.
+    """Make a synthetic observation; without one, and with the model's reason, if the model fails.
 
     Parameters
     ----------
     model : ObservationModel
-        The truth's own model; for a study without the inverse crime not the estimator's.
+        Of the truth. Use another model than the estimator's to avoid the inverse crime.
     parameters : names, (p,)
     values : (p,)
         True parameters.
     frames : sequence of str
-        Which of ``FRAMES`` are observed.
+        Observed frames, some of ``FRAMES``.
     variance : float or (f,) mm²
-        What the filter is to assume of the errors.
+        Of the errors, as the filter assumes it.
     correlation : SpatialCorrelation, optional
-        What the filter is to assume of their correlation; None for independent errors.
+        Of the errors, as the filter assumes it; None for independent errors.
     errors : sequence of ObservationError
-        What makes the observation differ from the truth, in this order.
+        Applied to the truth in this order.
     rng : numpy.random.Generator
-
-    Returns
-    -------
-    TwinData
-        Without an observation, and with the model's reason, if the model failed.
 
     Raises
     ------

@@ -1,17 +1,16 @@
-"""Can an estimate be believed? The verdict stands before every number of a case.
+"""Can an estimate be trusted? The verdict comes before every number of a case.
 
-A converged filter says only that its iterations ended. These checks ask more, and none needs the
-truth: the residual looks like the stated noise, no known quantity was stretched to fit, and the
-fitted valve closes as the observed one does. A check that fails gives a `FailedCheck` with its
-number and its limit. One doubtful check makes an estimate doubtful. Two doubtful checks, or one
-grave one, leave no estimate.
+A converged filter only says that its iterations ended. These checks need no truth: residuals match
+the stated noise, no known quantity was stretched to fit, the fitted valve closes as the observed
+one does. One doubtful check makes an estimate doubtful; two doubtful checks or one grave one leave
+no estimate.
 
 The limits were set on the even seeds of fifteen misspecified simulations (300 moduli) and judged on
 the odd seeds (298): intervals missed the truth in 1 of 164 (trustworthy), 2 of 70 (doubtful) and
 13 of 64 (none), median errors of the logarithm were 0.11, 0.13 and 0.20, and the area under the
-curve for a missed interval was 0.84. Both halves had been looked at before, with an earlier
-estimator, so new seeds must confirm it. Two checks were dropped because they predicted no miss: the
-distance of the fitted valve from the closed frame, and how much the data narrow the prior.
+curve for a missed interval was 0.84. Both halves had been looked at with an earlier estimator, so
+new seeds must confirm it. Two checks were dropped because they predicted no miss: the distance of
+the fitted valve from the closed frame, and how much the data narrow the prior.
 """
 
 from __future__ import annotations
@@ -24,26 +23,26 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 Trust: TypeAlias = Literal["trustworthy", "doubtful", "none"]
-"""How far an estimate may be believed; of ``none`` no number is stated."""
+"""Trust in an estimate; with ``none`` no number is stated."""
 
 TRUSTWORTHY: Trust = "trustworthy"
 DOUBTFUL: Trust = "doubtful"
 NONE: Trust = "none"
-RANK: Mapping[Trust, int] = {TRUSTWORTHY: 0, DOUBTFUL: 1, NONE: 2}
+LEVELS: tuple[Trust, ...] = (TRUSTWORTHY, DOUBTFUL, NONE)
 
 
 @dataclass(frozen=True, slots=True)
 class FailedCheck:
-    """One reason for a verdict.
+    """A failed check of an estimate.
 
     Attributes
     ----------
     check : str
-        What was looked at.
+        Its name.
     trust : Trust
         The best verdict that it admits.
     text : str
-        What was seen, with its number and what is expected.
+        What was found, with its number and the expected one.
     advice : str
         What to do next.
     """
@@ -56,17 +55,15 @@ class FailedCheck:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What may be believed of an estimate, and why.
+    """The trust in an estimate and its reasons.
 
     Attributes
     ----------
     trust : Trust
     failed_checks : tuple of FailedCheck
-        Those that speak against it, the gravest first; empty for a trustworthy one.
-    passed : tuple of str
-        The checks that it passed.
-    missing : tuple of str
-        The checks for which there was nothing to look at.
+        The gravest first; empty for a trustworthy estimate.
+    passed, missing : tuple of str
+        Names of the checks that it passed, and of those without data.
     """
 
     trust: Trust
@@ -85,22 +82,19 @@ Found: TypeAlias = Iterable[tuple[float, Mapping[str, object]]]
 
 
 def texts(*found: str) -> Found:
-    """Values that are texts; empty ones do not count."""
+    """Findings that are texts and always fail; empty ones are ignored."""
     return [(math.inf, {"what": text}) for text in found if text]
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One row of `CHECKS`.
+    """One table of ``checks.toml``; see its head.
 
     Attributes
     ----------
     name : str
-        Rows of one name are one check.
     limits : two numbers
-        Beyond the first a value is doubtful; beyond the second it leaves no estimate.
     text, advice : str
-        Of a `FailedCheck`. ``{value}`` and ``{limit}`` (the first) stand in it beside the words.
     """
 
     name: str
@@ -109,7 +103,7 @@ class Check:
     advice: str
 
     def failed_checks(self, found: Found) -> list[FailedCheck]:
-        """Those of the values that are beyond the limits."""
+        """The values above the limits."""
         doubtful, grave = self.limits
         return [
             FailedCheck(
@@ -124,12 +118,12 @@ class Check:
 
 
 def judge(seen: Mapping[str, Found]) -> Verdict:
-    """The verdict on an estimate: one doubtful check is doubtful, two are none.
+    """The verdict on an estimate.
 
     Parameters
     ----------
     seen : mapping
-        Key of a row of `CHECKS` -> what was found; a key is missing where nothing was looked at.
+        Key of `CHECKS` -> what was found. Checks without a key count as missing.
     """
     failed_checks: list[FailedCheck] = []
     missing: list[str] = []
@@ -141,9 +135,9 @@ def judge(seen: Mapping[str, Found]) -> Verdict:
         if key in NEEDED and not seen["failed"]:
             unknown = f"nothing is known of {check.name}"
             failed_checks.append(FailedCheck(check.name, DOUBTFUL, unknown, "record it"))
-    failed_checks.sort(key=lambda failed: -RANK[failed.trust])
-    against = {failed.check: RANK[failed.trust] for failed in reversed(failed_checks)}
-    trust = (TRUSTWORTHY, DOUBTFUL, NONE)[min(sum(against.values()), 2)]
+    failed_checks.sort(key=lambda failed: -LEVELS.index(failed.trust))
+    against = {failed.check: LEVELS.index(failed.trust) for failed in reversed(failed_checks)}
+    trust = LEVELS[min(sum(against.values()), 2)]
     names = dict.fromkeys(check.name for check in CHECKS.values())
     passed = tuple(name for name in names if name not in against and name not in missing)
     return Verdict(trust, tuple(failed_checks), passed, tuple(missing))
@@ -155,7 +149,7 @@ CHECKS: Mapping[str, Check] = {
         Path(__file__).with_name("checks.toml").read_text(encoding="utf-8")
     ).items()
 }
-"""What is looked at, by key: ``checks.toml``."""
+"""The checks of ``checks.toml`` by key."""
 
 NEEDED = ("innovation", "stretch")
 """Checks without which no estimate is trustworthy."""

@@ -1,1 +1,1 @@
-"""Files of others: read within stated bounds of size, memory and time, or refused in one line."""
+"""Readers of text, tables, documents and arrays of users, within bounds of size."""

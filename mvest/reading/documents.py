@@ -1,9 +1,8 @@
-"""JSON and YAML files as plain data: mappings, lists, text, numbers, and nothing else.
+"""JSON and YAML files as plain data: mappings, lists, text and finite numbers, of bounded size.
 
-Both are of bounded size and have finite numbers. Of YAML, tags (which ask for objects), aliases
-(with which a short text can grow without bound), repeated keys and endless nesting are refused, and
-only decimal numbers are numbers: what only YAML reads as one (hexadecimal, octal, sexagesimal, with
-underscores), and dates, are text.
+YAML tags (which create objects), aliases (which let a short text grow without bound), repeated keys
+and deep nesting are refused. Only decimal numbers are numbers; hexadecimal, octal and sexagesimal
+ones, those with underscores, and dates are text.
 """
 
 from __future__ import annotations
@@ -25,13 +24,12 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def read_mapping(path: Path, max_size: int = MAX_TEXT, where: str = "") -> dict[str, Any]:
-    """The mapping that a file of JSON holds; an error calls it ``where`` or by its path.
+    """The mapping in a JSON file; ``where`` is its name in errors, by default its path.
 
     Raises
     ------
     InputError
-        If it cannot be read, is larger than ``max_size`` bytes, holds something else, or is
-        refused by `parse_json`.
+        The file cannot be read, is larger than ``max_size`` bytes, or holds something else.
     """
     data = parse_json(read_bytes(path, max_size, where), where or str(path))
     if not isinstance(data, dict):
@@ -45,7 +43,7 @@ def validated(schema: type[M], data: Any, where: str) -> M:
     Raises
     ------
     InputError
-        If a field is missing, or is not what the schema says.
+        A field is missing, or does not fit the schema.
     """
     try:
         return schema.model_validate(data)
@@ -61,7 +59,7 @@ def parse_json(content: bytes | str, where: str) -> Any:
     Raises
     ------
     InputError
-        If it is no JSON, or holds NaN, an infinity, or half of a surrogate pair.
+        The text is no JSON, or holds NaN, an infinity, or half of a surrogate pair.
     """
     try:
         text = content if isinstance(content, str) else content.decode("utf-8-sig")
@@ -74,14 +72,14 @@ def parse_json(content: bytes | str, where: str) -> Any:
 
 
 MAX_FILE_SIZE = 1_000_000
-"""Bytes; a description of a case is a few thousand."""
+"""Bytes of a YAML file; a case has a few thousand."""
 MAX_DEPTH = 20
 MAX_VALUES = 50_000
-"""Of lists and mappings together; numbers of all vertices of a dozen rims are a few thousand."""
+"""Largest number of values; a case with a dozen lists of vertices has a few thousand."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Plain values, each key once. libyaml's loader is fifty times as fast, where there is one."""
+    """Plain values and unique keys. libyaml's loader, if installed, is fifty times as fast."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
@@ -94,7 +92,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         return mapping
 
     def construct_plain(self, node: Any) -> str | float:
-        """A number or a text within bounds."""
+        """A bounded number or text."""
         kind, text = node.tag.rpartition(":")[2], node.value
         try:
             if kind == "str":
@@ -129,8 +127,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        The file is missing, too large, no text, no YAML or no mapping; it uses tags or aliases,
-        repeats a key, nests too deeply, or holds text or a number that no output can hold.
+        The file is missing, too large, or no YAML mapping; it has tags, aliases, repeated keys,
+        deep nesting, or text or numbers beyond the bounds.
     """
     text = read_text(path, MAX_FILE_SIZE)
     try:
@@ -139,7 +137,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except InputError as fault:
         raise InputError(f"{path}: {fault}") from fault
     except (yaml.YAMLError, ValueError) as fault:
-        # The parser reads escapes of characters that there are not.
+        # ValueError: an escape that is no character.
         raise InputError(f"{path}: no valid YAML: {one_line(fault, 160)}") from fault
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds a {type(data).__name__}, expected a mapping of fields")
@@ -147,7 +145,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _check_events(events: Iterator[Any]) -> None:
-    """Refuse, before anything is built, what can grow without bound."""
+    """Refuse content that may grow without bound, before anything is built."""
     depth = 0
     for count, event in enumerate(events):
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:

@@ -1,4 +1,4 @@
-"""Reading NumPy's ``.npz``: plain arrays, whose stated sizes are checked before any is made."""
+"""Reading NumPy's ``.npz``: plain arrays whose stated sizes are checked before any is made."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from mvest.errors import InputError
 from mvest.reading.text import one_line
 
 MAX_BYTES = 2**29
-"""Of the arrays that are read from one file; what is compressed inflates to no more than stated."""
+"""Largest decoded size of the arrays that are read from one file."""
 KINDS = "biufSU"
-"""Of numbers and text."""
+"""Kinds of numbers and text."""
 
 _DAMAGE = (
     *(OSError, ValueError, LookupError, EOFError, RuntimeError, ArithmeticError, TypeError),
     *(SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
 )
-"""What ``zipfile``, ``zlib`` and NumPy raise of files that somebody damaged."""
+"""Exceptions of ``zipfile``, ``zlib`` and NumPy for damaged files."""
 
 
 def read_npz(
@@ -35,43 +35,39 @@ def read_npz(
     optional: Sequence[str] = (),
     where: str = "",
 ) -> dict[str, NDArray[Any]]:
-    """The arrays in a file, without pickled objects.
+    """The arrays in a file, without pickled objects, in the byte order of the machine.
 
     Parameters
     ----------
     path : Path or binary stream
     names : sequence of str, optional
-        Arrays that must be there, and the only ones that are read; without them all are.
+        Required arrays; only these are read. By default all are.
     exact : bool
-        Whether the file may hold no others.
+        Whether other arrays are refused.
     optional : sequence of str
-        Arrays beside these that are read if they are there.
+        Further arrays to read if they are there.
     where : str
-        What an error calls the file; its path without.
-
-    Returns
-    -------
-    dict
-        Arrays of numbers or text by their names, in the byte order of the machine.
+        Name of the file in errors; its path by default.
 
     Raises
     ------
     InputError
-        If the file is missing or damaged, lacks an array or holds others, or states more than
-        `MAX_BYTES`; the message is one line and names the array.
+        The file is missing or damaged, lacks an array or holds others, or states more than
+        `MAX_BYTES`.
     """
     where = where or str(path)
     try:
-        # The file holds nothing else: NumPy would read a pickle or a single array as well.
+        # NumPy itself would also read a pickle or a single array.
         with zipfile.ZipFile(path) as archive:
             sizes = {one.filename.removesuffix(".npy"): one.file_size for one in archive.filelist}
         wanted = list(sizes) if names is None else list(names)
         wanted += [name for name in optional if name in sizes and name not in wanted]
         if missing := ", ".join(name for name in wanted if name not in sizes):
             raise InputError(f"{where}: arrays {one_line(missing, 120)} are missing")
-        more = ", ".join(name for name in sizes if name not in wanted)
-        if exact and more:
-            raise InputError(f"{where}: holds arrays {one_line(more, 120)} beside those needed")
+        if exact and (more := ", ".join(name for name in sizes if name not in wanted)):
+            raise InputError(
+                f"{where}: holds arrays {one_line(more, 120)} in addition to those needed"
+            )
         total = sum(sizes[name] for name in wanted)
         if total > MAX_BYTES:
             raise InputError(f"{where}: {total} bytes of arrays, expected at most {MAX_BYTES}")
@@ -81,9 +77,9 @@ def read_npz(
             return {name: _plain(arrays[name], f"{where}: {one_line(name, 60)}") for name in wanted}
     except FileNotFoundError as fault:
         raise InputError(f"{where} is missing") from fault
+    except InputError:
+        raise
     except _DAMAGE as fault:
-        if isinstance(fault, InputError):
-            raise
         raise InputError(
             f"{where}: cannot be read: {one_line(fault, 100)}; expected .npz of plain arrays, "
             "without pickles"
@@ -91,7 +87,6 @@ def read_npz(
 
 
 def _plain(array: Any, where: str) -> NDArray[Any]:
-    """An array of numbers or text in the byte order of the machine."""
     # A member without NumPy's header comes as bytes. An array without bytes may state any length.
     plain = isinstance(array, np.ndarray) and array.dtype.kind in KINDS and array.dtype.itemsize
     if not plain or max(array.shape, default=0) > MAX_BYTES:
@@ -107,14 +102,14 @@ def _plain(array: Any, where: str) -> NDArray[Any]:
 def check_array(
     array: NDArray[Any], where: str, kind: str, shape: Sequence[int | None]
 ) -> NDArray[Any]:
-    """An array as text (kind U), or as 64-bit integers (i) or finite numbers (f), of a shape.
+    """An array as text (kind U), 64-bit integers (i) or finite numbers (f), of a given shape.
 
-    A length of None fits any. ``where`` names the array in an error.
+    A length of None fits any. ``where`` names the array in errors.
 
     Raises
     ------
     InputError
-        It is of another kind or shape, or holds numbers that are not finite.
+        Another kind or shape, or numbers that are not finite.
     """
     sizes = zip(shape, array.shape, strict=False)
     fits = array.ndim == len(shape) and all(want in (None, have) for want, have in sizes)

@@ -1,7 +1,4 @@
-"""Bytes, text, numbers, words and small tables from files that others wrote.
-
-Tables are comma-separated text, each with a header.
-"""
+"""Bytes, text, numbers and small comma-separated tables of other programs, within bounds."""
 
 from __future__ import annotations
 
@@ -20,13 +17,13 @@ from mvest.errors import InputError, MvestError, cannot_write
 from mvest.typing import FloatArray, IntArray
 
 MAX_TEXT = 2**26
-"""Bytes of a file of text, where its reader does not state less."""
+"""Default largest size of a text file (bytes)."""
 MAX_NUMBER = 1e9
-"""Of any number that a user gives, whatever its unit: far beyond sense, and far from overflow."""
+"""Largest magnitude of any number of a user, in any unit."""
 MAX_LINE = 300
-"""Characters of what is said of a file."""
+"""Longest message about a file (characters)."""
 MAX_WORDS = 20_000
-"""Characters of any text that a user gives."""
+"""Longest text of a user (characters)."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,5})?", re.ASCII)
 _MAX_DIGITS = 400
@@ -34,18 +31,17 @@ _UNWRITABLE = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\uff
 
 
 def read_bytes(path: Path, max_size: int = MAX_TEXT, where: str = "") -> bytes:
-    """All of a file, which an error calls ``where`` or by its path.
+    """The content of a file; ``where`` is its name in errors, by default its path.
 
     Raises
     ------
     InputError
-        If it is missing, is no regular file, cannot be read, or is larger than ``max_size`` bytes.
+        It is missing, not a regular file, not readable, or larger than ``max_size`` bytes.
     """
     where = where or str(path)
     try:
         mode = path.stat().st_mode
-        if not stat.S_ISREG(mode):
-            # Whoever opens a pipe waits for who writes to it.
+        if not stat.S_ISREG(mode):  # opening a pipe would block
             kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"
             raise InputError(f"{where} cannot be read: it is {kind}")
         with path.open("rb") as stream:
@@ -61,12 +57,12 @@ def read_bytes(path: Path, max_size: int = MAX_TEXT, where: str = "") -> bytes:
 
 
 def read_text(path: Path, max_size: int = MAX_TEXT, where: str = "") -> str:
-    """All of a file of UTF-8 text, with or without a byte order mark.
+    """The content of a UTF-8 file, with or without a byte order mark.
 
     Raises
     ------
     InputError
-        As `read_bytes`, and if it is no such text.
+        As `read_bytes`, or other than UTF-8.
     """
     try:
         return read_bytes(path, max_size, where).decode("utf-8-sig")
@@ -75,12 +71,12 @@ def read_text(path: Path, max_size: int = MAX_TEXT, where: str = "") -> str:
 
 
 def number(text: str, max_abs: float = MAX_NUMBER) -> float:
-    """A decimal number: finite, bounded, without underscores, hexadecimal or sexagesimal digits.
+    """A finite decimal number, without underscores, hexadecimal or sexagesimal digits.
 
     Raises
     ------
     InputError
-        If the text is none, or its magnitude is more than ``max_abs``.
+        The text is none, or its magnitude exceeds ``max_abs``.
     """
     plain = text.strip()
     value = float(plain) if len(plain) <= _MAX_DIGITS and _NUMBER.fullmatch(plain) else math.nan
@@ -91,24 +87,24 @@ def number(text: str, max_abs: float = MAX_NUMBER) -> float:
 
 
 def check_words(text: str, max_length: int = MAX_WORDS) -> str:
-    """The text, if every output can hold it: no control characters but line ends and tabs.
+    """The text, if all output formats can hold it.
 
     Raises
     ------
     InputError
-        If there are others, halves of surrogate pairs, or more than ``max_length`` characters.
+        It has control characters other than line ends and tabs, halves of surrogate pairs, or more
+        than ``max_length`` characters.
     """
     if len(text) > max_length:
         raise InputError(f"{len(text)} characters, expected at most {max_length}")
-    wrong = _UNWRITABLE.search(text)
-    if wrong is not None:
+    if wrong := _UNWRITABLE.search(text):
         code = f"U+{ord(wrong.group()):04X}"
         raise InputError(f"the character {code} at {wrong.start()}, which is no text; remove it")
     return text
 
 
 def one_line(text: object, max_length: int = MAX_LINE) -> str:
-    """What is said of a file, in one line of bounded length that any terminal can show."""
+    """A text in one line of bounded length that any terminal can show."""
     words = " ".join(str(text)[: 4 * max_length].split())
     line = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in words)
     return line if len(line) <= max_length else line[: max_length - 3] + "..."
@@ -116,7 +112,7 @@ def one_line(text: object, max_length: int = MAX_LINE) -> str:
 
 @contextmanager
 def refusing(path: Path, what: str) -> Iterator[None]:
-    """Let nothing out but errors of this package, in one line that names the file.
+    """Turn every exception into an error of this package, in one line that names the file.
 
     Raises
     ------
@@ -135,13 +131,7 @@ def refusing(path: Path, what: str) -> Iterator[None]:
 
 @contextmanager
 def named(*places: object) -> Iterator[None]:
-    """Put the first place before what an error of this package says, unless it begins with one.
-
-    Raises
-    ------
-    MvestError
-        As raised within.
-    """
+    """Prepend the first place to the errors of this package that begin with none of them."""
     try:
         yield
     except MvestError as fault:
@@ -150,21 +140,15 @@ def named(*places: object) -> Iterator[None]:
 
 
 def read_columns(file: Path, names: Sequence[str], where: str = "") -> dict[str, list[str]]:
-    """Columns of a table by their names, as text; they come in any order.
+    """Columns of a table by name, as text; the file has them in any order.
 
-    Parameters
-    ----------
-    file : Path
-    names : sequence of str
-        Of all columns.
-    where : str
-        What an error calls the file; its path without.
+    ``where`` is the name of the file in errors, by default its path.
 
     Raises
     ------
     InputError
-        The file cannot be read or is no text, its header is another, it has no rows, or a row is
-        too short or too long.
+        The file cannot be read or is no text, has another header or no rows, or a row is too short
+        or too long.
     """
     where = where or str(file)
     text = read_text(file, where=where)
@@ -201,6 +185,15 @@ def numbers(
     return result
 
 
+def read_numbers(
+    file: Path, names: Sequence[str], max_abs: float = MAX_NUMBER, where: str = ""
+) -> FloatArray:
+    """A table of finite numbers, ``(rows, columns)`` in the order of ``names``: `read_columns`."""
+    columns = read_columns(file, names, where)
+    cells = [numbers(where or str(file), name, columns[name], max_abs) for name in names]
+    return np.column_stack(cells)
+
+
 def indices(file: Path, name: str, cells: Sequence[str]) -> IntArray:
     """A column as numbers from 0."""
     for row, cell in enumerate(cells):
@@ -209,27 +202,18 @@ def indices(file: Path, name: str, cells: Sequence[str]) -> IntArray:
     return np.array([int(cell) for cell in cells], dtype=np.int64)
 
 
-def read_numbers(
-    file: Path, names: Sequence[str], max_abs: float = MAX_NUMBER, where: str = ""
-) -> FloatArray:
-    """A table of finite numbers, ``(rows, columns)`` in the order of ``names``: `read_columns`."""
-    columns = read_columns(file, names, where)
-    where = where or str(file)
-    return np.column_stack([numbers(where, name, columns[name], max_abs) for name in names])
-
-
 def read_vertices(file: Path) -> IntArray:
-    """The one column ``vertex`` of a table."""
+    """The only column ``vertex`` of a table."""
     return indices(file, "vertex", read_columns(file, ["vertex"])["vertex"])
 
 
 def write_columns(file: Path, names: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table; numbers keep all their digits.
+    """Write a table; numbers keep all digits.
 
     Raises
     ------
     InputError
-        If the file cannot be written.
+        The file cannot be written.
     """
     try:
         with file.open("w", encoding="utf-8", newline="") as stream:

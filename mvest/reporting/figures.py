@@ -167,7 +167,8 @@ def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
         unit = f" ({unknown.unit})" if unknown.unit else ""
         axes.set(xlabel="iteration", ylabel=unknown.name + unit)
         axes.xaxis.get_major_locator().set_params(integer=True)
-    keys, where = grid[0].get_legend_handles_labels(), "outside upper center"
+    where: Any = "outside upper center"
+    keys = grid[0].get_legend_handles_labels()
     figure.legend(*keys, loc=where, ncols=3, frameon=False, fontsize=SMALL)
     return figure
 

@@ -93,9 +93,8 @@ def arrive(
     if arrival.kind == "surfaces":
         return replace(patient, case=replace(case, frames=(opened, closed)))
     if arrival.kind not in KINDS:
-        raise ConfigurationError(
-            f"arrival.kind = {arrival.kind!r}, expected one of {', '.join(KINDS)}"
-        )
+        known = ", ".join(KINDS)
+        raise ConfigurationError(f"arrival.kind = {arrival.kind!r}, expected one of {known}")
     # Leaflets, annulus and tips are drawn in one image.
     tips = displace(closed.papillary_tips, registration, closed.annulus.mean(axis=0))
     closed = replace(closed, annulus=drawn[case.annulus], papillary_tips=tips)

@@ -57,7 +57,7 @@ class Misspecification:
     kernel: str = "matern"
     length_factor: Factor = 1.0  #: on the stated correlation length of the smooth errors
     annulus_mm: Length = 0.0  #: SD of each coordinate of a smooth error of the closed annulus
-    tips_mm: Length = 0.0  #: SD of each coordinate of the tips' error, the same in all frames
+    tips_mm: Length = 0.0  #: the same of the tips, equal in the open and the closed frame
     pressure_off: Share = 0.0  #: relative error, up or down at random
     thickness_off: Share = 0.0  #: the same of the thickness
     missing: Share = (

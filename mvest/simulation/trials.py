@@ -17,7 +17,7 @@ from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.pose import Poses, pose_of
 from mvest.imaging.detection.tracking import detect_valve
-from mvest.imaging.detection.trained_model import DetectionModel, load_model
+from mvest.imaging.detection.trained_model import load_model
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.training import render_frame
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
@@ -89,9 +89,7 @@ class Trial:
         return np.random.SeedSequence([self.seed, 1 + KINDS.index(self.kind), self.number])
 
 
-@lru_cache(maxsize=8)
-def _model(path: str) -> DetectionModel:
-    return load_model(path)
+_model = lru_cache(maxsize=8)(load_model)
 
 
 def try_volume(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, Any]:

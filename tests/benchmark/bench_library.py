@@ -99,7 +99,7 @@ def test_guided_closure(case, measure):
 @pytest.mark.parametrize("how", ["continued", "anchored"])
 def test_farther_closure(case, measure, tmp_path, how):
     c, about = case
-    valve = replace(c.model.fresh(), continuation=True, anchors=tmp_path)
+    valve = replace(c.model.fresh(), continuation=True)
     valve = valve if how == "anchored" else c.model.fresh()
     m = farther(about["size"])
     # The first closure builds the mechanics, and makes the anchor.

@@ -5,6 +5,7 @@ meet in a few steps. The states are not realistic; the equations are those of an
 """
 
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -22,7 +23,6 @@ from mvest.mechanics.settings import (
 from mvest.mechanics.steps import NewtonSettings, StepReason
 from mvest.mechanics.valve_system import HeldState, boundary_loading, build_system
 from mvest.valve.anatomy.template import Template
-from mvest.valve.anatomy.valve import Motion
 from mvest.valve.mesh.solid_mesh import embed
 from mvest.valve.mesh.structured import structured_mesh
 
@@ -91,59 +91,6 @@ def step_study(exact, run, m, k, coarse):
     return [float(np.linalg.norm(d - exact) / np.linalg.norm(exact)) for d in differences]
 
 
-def check_closed_derivatives(model, at, step=3.2e-3, least=0.1):
-    """Derivatives of the valve closed in contact against equilibria beside it."""
-    simulation = model.close(at).simulation
-    assert simulation.converged
-    assert simulation.records[-1].active_contacts > 100
-    start = simulation.frames[-1]
-    for k, name in enumerate(model.names):
-        exact = simulation.sensitivities[-1][k]
-        assert np.linalg.norm(exact) * at[k] > least, name
-        coarse, fine, best = step_study(
-            exact, lambda m: continued(model, start, m).frames[-1], at, k, step
-        )
-        assert coarse / fine == pytest.approx(16, rel=0.1) or coarse < 1e-6, name
-        assert best < 1e-6, name
-
-
-def check_moving_derivatives(model, at, steps):
-    """Derivatives of a moving valve, in which the history of strain is, against differences."""
-    simulation = model.close(at).simulation
-    assert simulation.converged
-    exact = simulation.sensitivities[-1]
-
-    def run(values):
-        result = model.close(values, sensitivities=False).simulation
-        assert result.converged
-        return result.frames[-1]
-
-    for k, name in enumerate(model.names):
-        assert np.linalg.norm(exact[k]) * at[k] > 1e-3, name
-        coarse, fine, best = step_study(exact[k], run, at, k, steps[k])
-        # Second order, unless the error is round-off already.
-        assert coarse / fine == pytest.approx(16, rel=0.2) or coarse < 1e-5, name
-        assert best < 1e-6, name
-
-
-@pytest.mark.parametrize("k", [0, 1], ids=MODULI)
-def test_derivatives_of_the_closed_valve_agree_with_differences_in_contact(closed, k):
-    model, simulation = closed
-    start = simulation.frames[-1]
-    assert simulation.records[-1].active_contacts > 200
-    exact = simulation.sensitivities[-1][k]
-    assert np.linalg.norm(exact) > 1.0  # mm/MPa over all nodes
-    coarse, fine, best = step_study(
-        exact, lambda m: continued(model, start, m).frames[-1], AT, k, 8e-4
-    )
-    assert coarse / fine == pytest.approx(16, rel=0.05)
-    assert fine < 1e-6
-    assert best < 1e-8
-
-
-FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
-
-
 def test_a_continued_closure_ends_in_the_state_of_one_from_the_open_valve(closed):
     model, simulation = closed
     other = AT * np.array([0.95, 1.05])
@@ -187,17 +134,6 @@ def test_a_guided_closure_ends_in_the_state_of_one_from_the_open_valve(closed):
     )
     # Every frame can only come from the open valve.
     assert len(guided.close(AT, sensitivities=False, every_frame=True).simulation.times) > 2
-
-
-def test_a_guide_that_does_not_hold_the_mesh_is_done_without(closed):
-    model, simulation = closed
-    coarse = model_of(CLOSING, cells=(10, 2))
-    # Farther away than a coarse mesh may cut a corner.
-    aside = replace(coarse.mesh, nodes=coarse.mesh.nodes + 3.0)
-    guided = replace(model, continuation=False, guide=replace(coarse, mesh=aside))
-    alone = guided.close(AT, sensitivities=False).simulation
-    assert len(alone.times) > 2
-    np.testing.assert_allclose(alone.frames[-1], simulation.frames[-1], rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize(("pressure", "lift"), [(95.0, 0.0), (100.0, 0.3)])
@@ -255,24 +191,20 @@ def test_a_continuation_that_fails_is_repeated_from_the_open_valve(monkeypatch):
 
 
 def test_a_restarted_model_forgets_to_the_last_bit(closed):
-    # Contact met on another way is in the pattern and in the order of elimination, which may round
-    # differently; after a restart both begin anew.
+    # Earlier contact is in the sparsity pattern and in the order of elimination, which may round
+    # differently.
     model, simulation = closed
-    start = ClosedState(AT, simulation.frames[-1])
-    near = 1.05 * AT
-    found = []
-    for way in ((), (np.array([4.0, 3.0]),)):
+    start, found = ClosedState(AT, simulation.frames[-1]), []
+    for before in (None, np.array([4.0, 3.0])):
         model.restart(start)
-        for m in way:
-            assert model(m).converged
+        if before is not None:
+            assert model(before).converged
             assert model._system._coupled.size
-            solver = model.solver
             model.restart(start)
             assert not model._system._coupled.size
-            assert model.solver is not solver
-        prediction = model(near)
+        prediction = model(1.05 * AT)
         found.append(prediction.y.tobytes() + prediction.jacobian.tobytes())
-        np.testing.assert_array_equal(model.closed.at, near)
+        np.testing.assert_array_equal(model.closed.at, 1.05 * AT)
     assert found[0] == found[1]
 
 
@@ -281,12 +213,10 @@ def test_a_restarted_guide_forgets_too():
     model = replace(model, guide=model_of(GENTLE, **SMALL), continuation=True)
     model.close(AT, sensitivities=False)
     state = model.closed
-    assert state.guide is not None
     model.restart(None)
     assert model.closed is None
     assert model.guide.closed is None
     model.restart(state)
-    np.testing.assert_array_equal(model.closed.positions, state.positions)
     np.testing.assert_array_equal(model.guide.closed.positions, state.guide.positions)
 
 
@@ -296,7 +226,6 @@ def test_a_restarted_guide_forgets_too():
         (np.inf, 3.0 * AT, 2),
         (0.2, 1.2 * AT, 2),
         (0.2, 1.3 * AT, 4),
-        (0.2, AT / [1.0, 1.3], 4),
         (0.0, AT, 2),
     ],
 )
@@ -309,7 +238,7 @@ def test_a_closure_is_continued_within_reach_only(reach, m, frames):
 
 def test_one_model_after_another_leaves_nothing_behind():
     # Retuned models keep their system; each value must come from its own arguments.
-    names = (*MODULI, *FACTORS)
+    names = (*MODULI, "pressure_scale", "chord_stiffness", "chord_rest_length")
     values = (np.array([*AT, 1.0, 1.0, 0.94]), np.array([3.0, 3.0, 0.8, 1.3, 0.97]))
     used = model_of(OPEN, names, **SMALL)
     one, two, one_again = (used(m) for m in (*values, values[0]))
@@ -401,25 +330,18 @@ def test_the_support_follows_the_annulus_within_micrometres(support):
 
 def test_loads_do_not_depend_on_the_mesh():
     # Chord patches, hinge and contact samples are given in the rest frame.
-    valve, contact_valve, settings = (
-        TEMPLATE.valve(16, 5),
-        TEMPLATE.valve(96, 32),
-        settings_of(CLOSING),
+    valves, moduli = (
+        (TEMPLATE.valve(16, 5), TEMPLATE.valve(96, 32)),
+        dict(zip(MODULI, AT, strict=True)),
     )
     first, other = (
-        build_system(
-            valve, contact_valve, structured_mesh(TEMPLATE, *kind), settings,
-            {"E_f.anterior": 6.23, "E_f.posterior": 2.09},
-        )
+        build_system(*valves, structured_mesh(TEMPLATE, *kind), settings_of(CLOSING), moduli)
         for kind in (("hex18", 36, 4), ("tet10", 24, 3))
-    )  # fmt: skip
-    for points in (
-        lambda s: s.cables.patches,
-        lambda s: s.hinge.points,
-        lambda s: s.contact.points,
-    ):
-        one, two = (points(system)(system.solid.mesh.nodes) for system in (first, other))
-        np.testing.assert_allclose(two, one, atol=1e-6)
+    )
+    for part in ("cables.patches", "hinge.points", "contact.points"):
+        embedded = attrgetter(part)
+        one, two = (embedded(system)(system.solid.mesh.nodes) for system in (first, other))
+        np.testing.assert_allclose(two, one, atol=1e-6, err_msg=part)
     np.testing.assert_array_equal(other.hinge.stiffness, first.hinge.stiffness)
 
 
@@ -429,29 +351,13 @@ def test_a_chord_is_spread_over_its_patch():
     points = embed(mesh, contact_valve.surface.vertices)
     insertion = valve.chordae.insertion
 
-    def patches_of(points, valve, radius):
-        members, weights, _ = valve_system.patch_members(valve, radius, insertion)
-        return points.average(weights, members)
-
     for radius in (1.0, 2.0):
-        patches = patches_of(points, contact_valve, radius)
+        members, weights, _ = valve_system.patch_members(contact_valve, radius, insertion)
+        patches = points.average(weights, members)
         np.testing.assert_allclose(patches.weights.sum(axis=1), 1, atol=1e-12)
         # The centre of a patch lies within it; at the free edge it is cut on one side.
         distance = np.linalg.norm(patches(mesh.nodes) - insertion, axis=1)
         assert distance.max() < 0.5 * radius
-    # The patch is a piece of the leaflet, however densely that is sampled: with area weights its
-    # centre converges (unweighted, samples of the free edge count twice and move it by 0.14 mm).
-    dense = TEMPLATE.valve(240, 61)
-    exact = embed(mesh, dense.surface.vertices)
-    centres = [
-        patches_of(p, v, 2.0)(mesh.nodes) for p, v in ((points, contact_valve), (exact, dense))
-    ]
-    assert np.linalg.norm(centres[0] - centres[1], axis=1).max() < 0.03
-    # A patch smaller than the samples' spacing takes the nearest sample.
-    patches = patches_of(points, contact_valve, 1e-6)
-    gap = np.linalg.norm(contact_valve.surface.vertices - insertion[:, None], axis=2).min(axis=1)
-    distance = np.linalg.norm(patches(mesh.nodes) - insertion, axis=1)
-    assert np.all(distance <= 1.05 * gap + 1e-6)
 
 
 def test_the_protocol_ramps_in_equal_steps_then_grows_to_the_end_and_to_equilibrium():
@@ -484,26 +390,6 @@ def test_the_loading_runs_from_the_open_to_the_closed_frame():
     np.testing.assert_array_equal(end.tips, motion.papillary_tips[-1])
     # Half way in time is half way in phase, and two frames are joined by a straight line.
     np.testing.assert_allclose(loading(0.1).hinge, 0.5 * (start.hinge + end.hinge), atol=1e-12)
-
-
-def test_more_key_frames_are_met_exactly_and_joined_without_overshoot():
-    model = model_of(CLOSING, **SMALL)
-    valve = model.contact_valve
-    phase = np.array([0.0, 0.5, 1.0])
-    shift = np.array([0.0, 1.0, 1.0])[:, None, None] * np.array([0.0, 0.0, 2.0])
-    moving = replace(
-        valve,
-        motion=Motion(phase, valve.motion.annulus[:1] + shift, valve.papillary_tips + shift),
-    )
-    moduli = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
-    system = build_system(model.valve, moving, model.mesh, model.settings, moduli)
-    loading = boundary_loading(system, model.valve, moving, model.settings)
-    times = np.linspace(0.0, 0.2, 41)
-    heights = [float(loading(t).tips[0, 2] - valve.papillary_tips[0, 2]) for t in times]
-    assert heights[0] == pytest.approx(0)
-    assert loading(0.1).tips[0, 2] - valve.papillary_tips[0, 2] == pytest.approx(2.0)
-    assert max(heights) <= 2.0 + 1e-12
-    assert np.all(np.diff(heights) >= -1e-12)
 
 
 def test_fixed_values_are_used_and_estimated_ones_go_before_them():

@@ -48,8 +48,7 @@ def step_of(name, default):
 
 
 def test_there_is_a_value_of_every_kind_here():
-    # The others are in test_model_exponential.py, test_model_stiffening.py and
-    # test_model_prestretch.py.
+    # The others are in test_model_laws.py.
     others = {*EXPONENTIAL_KINDS, "stiffening", "prestretch"}
     assert {name.partition(".")[0] for name in NAMES} == set(KINDS) - others
 

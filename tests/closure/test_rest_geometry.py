@@ -150,23 +150,6 @@ def test_a_valve_with_another_geometry_closes_as_its_derivative_says(closed, par
     assert np.linalg.norm(difference - exact) < 0.01 * np.linalg.norm(exact)
 
 
-def test_changes_of_several_parts_add_up(closed):
-    geometry = RestGeometry(closed)
-    at = geometry.surface.vertices.T / 10.0
-    moves = {part: 1e-3 * PARTS[part](at, closed) for part in ("shape", "thickness", "tips")}
-    model = geometry.displaced(moves)
-    each = [geometry.displaced({part: move}) for part, move in moves.items()]
-    nodes = sum(one.mesh.nodes - closed.mesh.nodes for one in each)
-    np.testing.assert_allclose(model.mesh.nodes - closed.mesh.nodes, nodes, atol=1e-12)
-    np.testing.assert_array_equal(
-        model.contact_valve.motion.papillary_tips[-1],
-        each[2].contact_valve.motion.papillary_tips[-1],
-    )
-    np.testing.assert_array_equal(
-        model.contact_valve.surface.thickness, each[1].contact_valve.surface.thickness
-    )
-
-
 def test_a_leaflet_is_thicker_on_both_faces_and_moves_as_a_whole(closed):
     # Contact is sampled on the surface itself, as in a case.
     geometry = RestGeometry(replace(closed, valve=closed.contact_valve))

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from mvest.errors import InputError
 from mvest.estimation import (
-    ApproximationCheck,
     EnsembleFilter,
     ExtendedFilter,
     Gaussian,
@@ -82,10 +80,3 @@ def test_false_alarms_on_mildly_nonlinear_models_are_rare(noise) -> None:
             found = filter_(decays, prior, y, noise**2, transform=Log())
             alarms += not found.trusted
     assert alarms <= 1
-
-
-def test_a_check_is_about_its_limit() -> None:
-    assert ApproximationCheck("a", 0.2, 0.25, 1).holds
-    assert not ApproximationCheck("a", np.inf, 0.25, 1).holds
-    with pytest.raises(InputError, match="a check needs a value"):
-        ApproximationCheck("a", np.nan, 0.25, 1)

@@ -160,20 +160,6 @@ def test_its_derivatives_are_those_of_differences() -> None:
         assert slope[k] == pytest.approx(expected, rel=1e-7, abs=1e-6), family.names[k]
 
 
-@pytest.mark.parametrize(("reference", "error"), [(1.0, 0.02), (3.0, 0.25)])
-def test_what_is_stated_is_the_median_of_what_is_believed(reference: float, error: float) -> None:
-    spectrum = Spectrum(LogNormal(0.6, 2.0), LogNormal(10.0, 2.0), reference=reference)
-    basis = smooth_basis(POINTS, spectrum.reference_length)
-    block = NoiseBlock("rough", np.ones(len(POINTS)), 1, basis)
-    family = NoiseFamily((block,), {"rough": LogNormal(0.1)}, spectrum.prior(POINTS))
-    W = family.stated().whiten(np.eye(len(POINTS)))
-    R = np.linalg.inv(W.T @ W)
-    stated = 0.36 * matern(DISTANCE, 10.0) + 0.01 * np.eye(len(POINTS))
-    # Eigenvectors of a longer correlation are bent at the edges of the sheet.
-    assert np.linalg.norm(R - stated) < error * np.linalg.norm(stated)
-    assert np.trace(R) == pytest.approx(np.trace(stated), rel=0.02)
-
-
 def posterior_of(learned: LearnedNoise, e: FloatArray, columns: FloatArray) -> Gaussian:
     """Of unit quantities with the uncertainty of the noise."""
     posterior = kalman_update(UNIT[columns.shape[1]], e, columns, learned.noise).posterior
@@ -252,23 +238,6 @@ def test_a_filter_learns_the_noise_where_the_model_is_not_linear() -> None:
     # No more runs than with the noise given.
     given = IteratedFilter(1e-6)(curved, UNIT[8], y, found.learned.noise)
     assert found.forward_solves <= given.forward_solves + 1
-
-
-def test_the_factor_of_added_columns_is_learned() -> None:
-    rng = np.random.default_rng(4)
-    # What 45 waves of an open shape do: three times as much as was said.
-    waves = [(a, b) for a in range(3, 12) for b in range(1, 6)]
-    columns = 0.1 * slopes(POINTS, waves)
-    family = FAMILY.plus(ErrorColumns("open shape", columns, 3.0))
-    e = 3.0 * columns @ rng.standard_normal(columns.shape[1])
-    e += 0.2 * rng.standard_normal(family.size)
-    learned = learn_noise(family, e, B).quantities[-1]
-    assert learned.name == "open shape"
-    low, high = learned.learned.interval()
-    assert low < 3.0 < high
-    assert learned.learned.factor < 1.5
-    # Two thirds of a standard deviation less than log 3 / log 3.
-    assert 0.6 < learned.stretch < 1.2
 
 
 @pytest.mark.parametrize(

@@ -56,20 +56,6 @@ def test_intervals_hold_the_truth_as_often_as_stated_and_those_of_the_filter_do_
     assert filters[0] / tries < 0.8
 
 
-def test_samples_of_one_source_are_left_out_together():
-    samples = errors(6, 8)
-    alone = sampled(0.2, samples).posterior(H, P0)
-    # Twice the same adds nothing: were the copies taken for independent, a gain that has seen one
-    # of them would be better than it is where neither was seen.
-    twice = np.concatenate([samples, samples], axis=1)
-    together = sampled(0.2, twice, np.tile(np.arange(6), 2)).posterior(H, P0)
-    np.testing.assert_allclose(together.covariance, alone.covariance, rtol=1e-9)
-    apart = sampled(0.2, twice).posterior(H, P0)
-    assert np.all(np.diag(apart.from_samples) < 0.7 * np.diag(alone.from_samples))
-    with pytest.raises(InputError, match="one for each of 12 samples"):
-        sampled(0.2, twice, np.arange(6))
-
-
 def test_the_posterior_is_that_of_a_gain_without_the_source_of_each_sample():
     rng = np.random.default_rng(14)
     places = np.linspace(0.0, 1.0, N)

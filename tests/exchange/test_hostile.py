@@ -1,4 +1,4 @@
-"""Files that grow to gigabytes, or claim to: refused in one line, by the readers and by command."""
+"""Damaged and hostile files are refused in one line, by the readers and by the command."""
 
 import base64
 import gzip
@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import nibabel
 import numpy as np
 import pydicom
 import pytest
@@ -64,19 +63,14 @@ def replaced(old: bytes, new: bytes) -> Change:
     return change
 
 
-def vtk_bomb(whole: bytes, appended: bool = False, mib: int = 4096) -> bytes:
+def vtk_bomb(whole: bytes, mib: int = 4096) -> bytes:
     """Points that are one compressed block of zeros."""
     packed = zeros(mib)
     head = struct.pack("<4Q", 1, mib * MIB, 0, len(packed))
     whole = whole.replace(b"<VTKFile ", b'<VTKFile compressor="vtkZLibDataCompressor" ')
     start = whole.index(b'format="ascii"', whole.index(b'Name="Points"'))
-    end = whole.index(b"</DataArray>", start)
-    if not appended:
-        text = base64.b64encode(head) + base64.b64encode(packed)
-        return whole[:start] + b'format="binary">' + text + whole[end:]
-    tail = b'<AppendedData encoding="raw">_' + head + packed + b"</AppendedData></VTKFile>"
-    rest = whole[end:].replace(b"</VTKFile>", tail)
-    return whole[:start] + b'format="appended" offset="0">' + rest
+    text = base64.b64encode(head) + base64.b64encode(packed)
+    return whole[:start] + b'format="binary">' + text + whole[whole.index(b"</DataArray>", start) :]
 
 
 def billion_laughs(whole: bytes) -> bytes:
@@ -112,12 +106,6 @@ def damaged(whole: bytes) -> bytes:
     return whole[:-2000] + bytes([whole[-2000] ^ 0xFF]) + whole[-1999:]
 
 
-def nifti_huge(whole: bytes) -> bytes:
-    header = nibabel.Nifti1Header(whole[:348])
-    header.set_data_shape((9000, 9000, 9000, 3))
-    return header.binaryblock + whole[348:]
-
-
 def dicom_huge(whole: bytes) -> bytes:
     data = pydicom.dcmread(io.BytesIO(whole))
     data.Rows = data.Columns = data[0x3001, 0x1001].value = 9000
@@ -126,77 +114,55 @@ def dicom_huge(whole: bytes) -> bytes:
 
 
 HELD = "expected at most 4 GiB"
-HOSTILE: dict[str, tuple[str, Change] | tuple[str, Change, str]] = {
-    "VTP inflates to 4 GiB": (VTP, vtk_bomb),
-    "appended VTP inflates to 4 GiB": (VTP, lambda whole: vtk_bomb(whole, True)),
-    "VTU inflates to 4 GiB": (VTU, vtk_bomb),
-    "VTP of entities of entities": (VTP, billion_laughs),
+HUGE = replaced(b"16 17 21 3", b"9000 9000 9000 3")
+ABSENT = "points that do not exist"
+Hostile = tuple[str, Change, str]
+HOSTILE: dict[str, Hostile] = {
+    "VTP inflates to 4 GiB": (VTP, vtk_bomb, ""),
+    "VTP of entities of entities": (VTP, billion_laughs, ""),
     "VTP of an entity outside": (VTP, lambda whole: (
         b'<!DOCTYPE l [<!ENTITY x SYSTEM "/etc/hostname">]>' + whole.replace(b"40 0 1", b"&x;")
-    )),
-    "VTP of an index without end": (VTP, replaced(b"0 1 2", b"0 1 " + LONG)),
-    "VTU of offsets that fall": (VTU, replaced(b"3 6 9", b"6 3 9")),
-    "VTP in an unknown encoding": (
-        VTP, lambda whole: b'<?xml version="1.0" encoding="x"?>' + whole
-    ),
-    "OBJ of an index without end": (OBJ, replaced(b"f 1 2 3", b"f 1 2 " + LONG)),
-    "OBJ in another encoding": (OBJ, lambda whole: whole.decode().encode("utf-16")),
+    ), ""),
+    "OBJ in another encoding": (OBJ, lambda whole: whole.decode().encode("utf-16"), ""),
     "NRRD inflates to 4 GiB": (NRRD, nrrd_bomb, "needs more than 1 GiB"),
-    "NRRD of 9000^3 voxels": (NRRD, replaced(b"16 17 21 3", b"9000 9000 9000 3"), HELD),
-    "NRRD skips 10^9 lines": (NRRD, replaced(b"encoding", b"line skip: 1000000000\nencoding")),
-    "NRRD skips 10^30 bytes": (NRRD, replaced(b"encoding", b"byte skip: 1" + LONG + b"\nencoding")),
+    "NRRD of 9000^3 voxels": (NRRD, HUGE, HELD),
+    "NRRD skips 10^9 lines": (
+        NRRD, replaced(b"encoding", b"line skip: 1000000000\nencoding"), "line skip"),
+    "NRRD of damaged gzip": (NRRD, damaged, ""),
     "NIfTI inflates to 4 GiB": (NIFTI, nifti_bomb, "needs more than 1 GiB"),
-    "NIfTI of 9000^3 voxels": ("NIfTI: NIfTI-1, uint8, .nii", nifti_huge, HELD),
-    "NIfTI of damaged gzip": (NIFTI, damaged),
+    "NIfTI of damaged gzip": (NIFTI, damaged, ""),
     "MetaImage inflates to 4 GiB": (META, meta_bomb, "needs more than 1 GiB"),
-    "MetaImage of 9000^3 voxels": (META, replaced(b"16 17 21 3", b"9000 9000 9000 3"), HELD),
-    "MetaImage of damaged zlib": (META, damaged),
-    "NRRD of damaged gzip": (NRRD, damaged),
-    "MetaImage of 10^400 voxels": (META, replaced(b"16 17 21 3", b"16 17 21 " + LONG)),
+    "MetaImage of 9000^3 voxels": (META, HUGE, HELD),
+    "MetaImage of damaged zlib": (META, damaged, ""),
+    "MetaImage of 10^400 voxels": (META, replaced(b"16 17 21 3", b"16 17 21 " + LONG), ""),
     "MetaImage in another folder": (
-        META, lambda whole: whole[: whole.index(b"LOCAL")] + b"/dev/zero\n"
-    ),
-    "DICOM with a value of 4 GiB": (DICOM, dicom_long),
+        META, lambda whole: whole[: whole.index(b"LOCAL")] + b"/dev/zero\n", "same folder"),
+    "DICOM with a value of 4 GiB": (DICOM, dicom_long, ""),
     "DICOM of 9000^3 voxels": (DICOM, dicom_huge, HELD),
-    "markups of a number without end": ("Markups: 1.0.3, LPS", replaced(b"-6.25", LONG)),
-    "markups of 5000 digits": ("Markups: 1.0.3, LPS", replaced(b"-6.25", b"1" * 5000)),
-    "nested markups": ("Markups: 1.0.3, LPS", lambda _: b"[" * 10**6),
+    "markups of 5000 digits": ("Markups: 1.0.3, LPS", replaced(b"-6.25", b"1" * 5000), ""),
+    "nested markups": ("Markups: 1.0.3, LPS", lambda _: b"[" * 10**6, ""),
 }  # fmt: skip
-
-
-STRUCTURED = b"# vtk DataFile Version 4.2\nx\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS "
-POINTS = b" 1\nORIGIN 0 0 0\nSPACING 1 1 1\n"
+STRUCTURED = b"# vtk DataFile Version 4.2\nx\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS 1 1 1\n"
 CELLS = b"POLYGONS 3 12\n3 0 1 2 \n3 2 1 3 \n3 1 4 3 \n"
-ABSENT = "points that do not exist"
 DAMAGED: tuple[tuple[str, bytes | None, bytes, str], ...] = (
     (VTK, None, b"", "damaged"),
     (VTK, b"POINTS 5", b"POINTS 2147483648", "damaged"),
-    (VTK, b"POINTS 5", b"POINTS -3", "damaged"),
     (VTK, None, b"# vtk DataFile Version 4.2\nx\nASCII\nDATASET POLYDATA\nPOINTS 3 float\n0 0 1",
      "damaged: Error reading ascii"),
-    (VTK, b"40 0 1", b"x 0 1", "damaged: Error reading ascii"),
     (VTK, b"40 0 1", b"nan 0 1", r"points \[4\] are not finite"),
-    (VTK, b"POLYGONS 3 12", b"POLYGONS 2147483648 8589934592", "damaged"),
     (VTK, b"3 1 4 3", b"3 1 5 3", ABSENT),
     (VTK, b"3 1 4 3", b"3 1 4 -1", ABSENT),
-    (VTK, b"3 1 4 3", b"300 1 4 3", ABSENT),
     ("VTK: 5.1, text, int32, scalars", b"0 3 6 9", b"0 900 6 9", ABSENT),
     (VTK, b"SCALARS region int \nLOOKUP_TABLE default", b"FIELD f 1\nregion 1 9 int\n1 2 2 1 2 2",
      "'region' has 9 rows, expected 3 cells"),
     (VTK, CELLS, CELLS.replace(b"POLYGONS", b"LINES"), "no triangles"),
-    (VTK, CELLS, b"", "no triangles|damaged"),
-    (VTK, None, STRUCTURED + b"9000 9000 9000\nORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA "
-     b"729000000000\nSCALARS a double 1\nLOOKUP_TABLE default\n1\n", r"a\.vtk: "),
-    (VTK, None, STRUCTURED + b"1 1" + POINTS, "expected PolyData"),
+    (VTK, None, STRUCTURED + b"ORIGIN 0 0 0\nSPACING 1 1 1\n", "expected PolyData"),
     (VTP, None, b"nonsense", "damaged: Error parsing XML"),
-    (VTU, None, b"nonsense", "damaged: Error parsing XML"),
     (VTP, None, b"<VTKFile type='ImageData'/>", "damaged: Cannot find PolyData"),
     (VTP, b'NumberOfPolys="3"', b'NumberOfPolys="2147483648"', "damaged"),
-    (VTP, b'NumberOfPoints="5"', b'NumberOfPoints="2147483648"', "damaged"),
-    (VTP, b'NumberOfPoints="5"', b'NumberOfPoints="4611686018427387904"', "damaged"),
     (VTP, b"1 4 3", b"1 5 3", ABSENT),
-    (VTP, b"3 6 9", b"3 6 900", "damaged"),
-    (VTP, b"40 0 1", b"x 0 1", "damaged"),
+    (VTP, b"0 1 2", b"0 1 " + LONG, ""),
+    (VTU, b"3 6 9", b"6 3 9", ""),
     (STL, None, b"", "0 bytes, expected 84"),
     (STL, None, bytes(80) + b"\xff\xff\xff\xff" + bytes(150), "expected 214748364834 for"),
     (STL, None, bytes(84), "no points"),
@@ -204,9 +170,7 @@ DAMAGED: tuple[tuple[str, bytes | None, bytes, str], ...] = (
     (STL, b"vertex 40", b"vertex x", "damaged"),
     (PLY, None, b"nonsense", "damaged or no PLY"),
     (PLY, b"ascii", b"EBCDIC", "format EBCDIC, expected ascii, binary_"),
-    (PLY, b"end_header", b"", "damaged or no PLY file"),
     (PLY, b"vertex 5", b"vertex 2147483648", "rows too early"),
-    (PLY, b"vertex 5", b"vertex -5", "damaged"),
     (PLY, b"float x", b"float w", "no element vertex with x, y and z"),
     (PLY, b"3 1 4 3", b"3 1 4 3 5", "1 numbers more than its header says"),
     (OBJ, None, b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles"),
@@ -216,7 +180,7 @@ DAMAGED: tuple[tuple[str, bytes | None, bytes, str], ...] = (
     (OBJ, b"v 40.0", b"v 1e12", r"points \[4\] .* 1e\+09"),
     (OBJ, b"v 40.0 0.0 1.0", b"v 40.0 0.0", "damaged"),
 )  # fmt: skip
-"""What stands in a file in place of something, or of all, and what is said of it."""
+"""A piece of a file (None: all of it), what replaces it, and words of the error."""
 for number, (kind, before, after, words) in enumerate(DAMAGED):
     change = (lambda _, content=after: content) if before is None else replaced(before, after)
     HOSTILE[f"{kind}: {number}"] = kind, change, words
@@ -232,13 +196,13 @@ def read(path: Path) -> object:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_it_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
-    kind, change, *words = HOSTILE[name]
+def test_a_damaged_file_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    kind, change, words = HOSTILE[name]
     path = tmp_path / VARIANTS[kind].file
     VARIANTS[kind].write(path)
     whole = path.read_bytes()
     path.write_bytes(change(whole))
-    with pytest.raises(MvestError, match=words[0] if words else None) as caught:
+    with pytest.raises(MvestError, match=words or None) as caught:
         read(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
@@ -261,12 +225,8 @@ def test_files_that_are_not_there_or_of_no_kind_are_named(tmp_path: Path) -> Non
 SCENES: dict[str, tuple[Callable[[Any], object], str]] = {
     "compressed": (lambda d: d.update(extensionsRequired=["KHR_draco"]), "needs KHR_draco"),
     "data elsewhere": (lambda d: d["buffers"][0].update(uri="a.bin"), "damaged"),
-    "more numbers": (lambda d: d["accessors"][0].update(count=7), "damaged"),
     "far more": (lambda d: d["accessors"][0].update(count=2**40), "damaged"),
-    "no numbers": (lambda d: d["accessors"][0].pop("bufferView"), "needs sparse or compressed"),
     "sparse": (lambda d: d["accessors"][0].update(sparse={}), "needs sparse or compressed arrays"),
-    "more bytes": (lambda d: d["bufferViews"][0].update(byteLength=10**6), "damaged"),
-    "no such node": (lambda d: d["scenes"][0].update(nodes=[-1]), "damaged"),
     "far away": (lambda d: d["nodes"][0].update(translation=[1e300, 0, 0]), "not finite numbers"),
     "no nodes": (lambda d: d["scenes"][0].update(nodes=[]), "no points"),
     "version 1": (lambda _: None, "only GLTF 2"),
@@ -285,13 +245,10 @@ def test_scenes_that_are_damaged_or_packed_otherwise(name: str, tmp_path: Path) 
 
 
 CUT = (
-    *(VTP, VTU, "VTP: base64, zlib, UInt64, LittleEndian, Int64", "GLB: one mesh"),
-    *(f"VTK: {v}, {form}, int32, scalars" for v in ("4.2", "5.1") for form in ("text", "binary")),
-    *("STL: VTK binary", STL, PLY),
-    "PLY: binary little endian, float, uchar",
-    *(NRRD, "NRRD by pynrrd: .seq.nrrd, frames last, raw, uint8", META),
-    *("MetaImage: .mha, 4D, uint8, plain", NIFTI, "NIfTI: NIfTI-1, uint8, .nii", DICOM),
-    "Markups: 1.0.3, LPS",
+    *("VTP: base64, zlib, UInt32, LittleEndian, Int32", "GLB: one mesh"),
+    *("VTK: 4.2, text, int32, scalars", "VTK: 5.1, binary, int32, scalars"),
+    *("STL: VTK binary", STL, PLY, "PLY: binary little endian, float, uchar"),
+    *(NRRD, META, "MetaImage: .mha, 4D, uint8, plain", NIFTI, DICOM, "Markups: 1.0.3, LPS"),
 )
 
 
@@ -300,7 +257,7 @@ def test_a_file_cut_anywhere_is_refused(name: str, tmp_path: Path) -> None:
     path = tmp_path / VARIANTS[name].file
     VARIANTS[name].write(path)
     whole = path.read_bytes()
-    for share in (0.0, 0.01, 0.1, 0.3, 0.6, 0.95):
+    for share in (0.01, 0.3, 0.95):
         path.write_bytes(whole[: int(share * len(whole))])
         with pytest.raises(MvestError):
             read(path)
@@ -331,18 +288,16 @@ def test_a_zip_bomb_in_a_case(tmp_path: Path) -> None:
         read_case(tmp_path / "case")
 
 
-@pytest.mark.parametrize("name", ["gzip", "zlib in XML", "entities of XML", "zip"])
+@pytest.mark.parametrize("name", ["gzip", "zip"])
 def test_a_bomb_is_one_line_of_the_command(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / {"gzip": "a.nii.gz", "zip": "a.nii.gz"}.get(name, "a.vtp")
+    path = tmp_path / "a.nii.gz"
     if name == "zip":
         zip_bomb(path)
     else:
-        wanted = NIFTI if name == "gzip" else VTP
-        bomb = {"gzip": nifti_bomb, "zlib in XML": vtk_bomb}.get(name, billion_laughs)
-        VARIANTS[wanted].write(path)
-        path.write_bytes(bomb(path.read_bytes()))
+        VARIANTS[NIFTI].write(path)
+        path.write_bytes(nifti_bomb(path.read_bytes()))
     given = ["tips=[-16,0,-25,16,0,-25]"]
     assert cli.main(["import", "leaflets", str(path), str(tmp_path / "case"), *given]) == 2
     said = capsys.readouterr()

@@ -52,7 +52,6 @@ READ: dict[str, tuple[Callable[[Any], object], list[list[float]], tuple[str, ...
         (10 * TIPS.points).tolist(),
         (),
     ),
-    "micrometres": (lambda c: c.update(coordinateUnits="um"), (TIPS.points / 1000).tolist(), ()),
     # As Slicer writes a point that was listed and never placed.
     "not placed": (
         lambda c: first(c).update(position="", positionStatus="undefined"),
@@ -61,8 +60,6 @@ READ: dict[str, tuple[Callable[[Any], object], list[list[float]], tuple[str, ...
     ),
     "no position": (lambda c: first(c).pop("position"), [[4, 5, -6.25]], ("anterolateral",)),
     "no list of points": (lambda c: c.pop("controlPoints"), [], ()),
-    "one label twice": (lambda c: first(c).update(label="posteromedial"), TIPS.points.tolist(), ()),
-    "no label": (lambda c: first(c).pop("label"), TIPS.points.tolist(), ()),
     "the name of another list": (lambda c: c.update(name="annulus"), TIPS.points.tolist(), ()),
 }
 
@@ -80,13 +77,8 @@ def test_what_slicer_reads_is_read(tmp_path: Path, what: str) -> None:
 BAD: dict[str, tuple[Callable[[Any], object], str]] = {
     "another system": (lambda c: c.update(coordinateSystem="IJK"), "markups.0.coordinateSystem"),
     "another unit": (lambda c: c.update(coordinateUnits="inch"), "markups.0.coordinateUnits"),
-    "no kind": (lambda c: c.pop("type"), "markups.0.type"),
     "two numbers": (lambda c: first(c).update(position=[1, 2]), "markups.0.controlPoints.0"),
-    "no number": (lambda c: first(c).update(position=[1, True, 2]), "markups.0.controlPoints.0"),
     "nan": (lambda c: first(c).update(position=[1, float("nan"), 2]), "markups.0.controlPoints.0"),
-    "far": (lambda c: first(c).update(position=[1, 10**400, 2]), "markups.0.controlPoints.0"),
-    "another status": (lambda c: first(c).update(positionStatus="x"), "markups.0.controlPoints.0"),
-    "no object": (lambda c: c.update(controlPoints=[3]), "markups.0.controlPoints.0"),
 }
 
 
@@ -101,12 +93,8 @@ def test_a_bad_list_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "{}", "[]", "3", "[" * 10**5, '{"@schema": "markups-schema-v1.0.0.json#", "markups": []}',
-        '{"@schema": "x", "markups": [{"type": "Line"}]}', '{"markups": [{"type": "Line"}]}',
-    ],
-)  # fmt: skip
+    "text", ["{}", "[" * 10**5, '{"@schema": "x", "markups": [{"type": "Line"}]}']
+)
 def test_what_is_no_file_of_markups_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.mrk.json"
     path.write_text(text)
@@ -120,7 +108,6 @@ ROWS = 'F-1,1.5,-2,3,0,0,0,1,1,1,0,"A, P",,\n\nF-2,4,5,-6.25,0,0,0,1,1,1,0,AL,,v
 FCSV = {
     "5.6": (HEAD.format("5.6", "LPS") + COLUMNS + ROWS.replace("\n", "\r\n"), 1),
     "no header": (ROWS, -1),
-    "3": ('# columns = label,x,y,z,sel,vis\n"A, P",1.5,-2,3,1,1\nAL,4,5,-6.25,1,1\n', -1),
 }
 
 
@@ -138,8 +125,6 @@ def test_fcsv_with_quotes_and_without_a_header(tmp_path: Path, version: str) -> 
     [
         ("= LPS", "= IJK", "CoordinateSystem"),
         ("4,5,", "4,x,", "position of point 2"),
-        (',3,0,0,0,1,1,1,0,"A, P",,', "", "position of point 1"),
-        ("x,y,z", "r,a,s", "position of point 1"),
     ],
 )
 def test_a_bad_fcsv_is_refused_in_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:
@@ -155,6 +140,5 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
         write_markups(tmp_path / "a.mrk.json", {})
     with pytest.raises(InputError, match="missing"):
         read_markups(tmp_path / "a.mrk.json")
-    for points in (np.zeros((2, 3)), np.full((1, 3), np.nan)):
-        with pytest.raises(InputError, match="expected"):
-            PointList(("a",), points)
+    with pytest.raises(InputError, match=r"markups\.0\.controlPoints\.0"):
+        write_markups(tmp_path / "a.mrk.json", {"a": PointList(("a",), np.full((1, 3), np.nan))})

@@ -12,15 +12,6 @@ from tests.experiments.composed_once import composed_once
 
 
 @pytest.fixture(autouse=True)
-def compiled(monkeypatch):
-    """Whatever was compiled before: on a fresh installation a note precedes what is tested here.
-
-    That it is given is tested in processes of their own (``test_first_use.py``).
-    """
-    monkeypatch.setattr("experiments.common.progress.kernels_are_compiled", lambda: True)
-
-
-@pytest.fixture(autouse=True)
 def no_hydra_left_over():
     yield
     GlobalHydra.instance().clear()

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from tests.places import ROOT
 
@@ -17,6 +18,7 @@ NAME = re.compile(r"`((?:experiments|conf)/[\w/]+\.(?:py|yaml))`")
 COMMAND = re.compile(r"^    mvest run (experiment=\w+)$", re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_the_page_on_adding_a_study_works_literally(tmp_path):
     for name in ("experiments", "conf"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import sysconfig
 import venv
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from tests.places import ROOT
 def handed(monkeypatch):
     """Overrides that the application would have been given."""
     given = []
-    monkeypatch.setattr(cli, "_application", lambda overrides: given.append(overrides) or 0)
+    monkeypatch.setattr(cli, "run_command", lambda overrides: given.append(overrides) or 0)
     return given
 
 
@@ -40,27 +41,6 @@ def test_every_experiment_is_listed_with_one_sentence(capsys):
         ).read_text(encoding="utf-8")
         assert 20 < len(sentence) < 200, name
         assert len(re.findall(r"[.?!] [A-Z]", sentence)) == 0
-
-
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("# @package _global_\n# Is it\n# one? And more.\ntitle: T\n", "Is it one?"),
-        ("# From case.yaml to moduli.\ntitle: T\n", "From case.yaml to moduli."),
-        ("# @package _global_\nname: x\ntitle: 'A title'\n", "A title"),
-        ("# without an end\ntitle: T\n", "T"),
-    ],
-)
-def test_the_sentence_of_an_experiment(tmp_path, text, sentence):
-    (tmp_path / "x.yaml").write_text(text)
-    assert cli.experiments_in(tmp_path) == {"x": sentence}
-
-
-def test_the_list_is_folded_to_the_width():
-    lines = cli.listing({"a": "word " * 40, "longer": "One."}, 60).splitlines()
-    assert max(map(len, lines)) <= 60
-    assert lines[-1] == "longer  One."
-    assert all(line.startswith(" " * 8) for line in lines[1:-1])
 
 
 def test_what_is_about_one_path_is_handed_on(handed):
@@ -126,13 +106,40 @@ def test_the_name_of_an_experiment_stands_for_it(word, message):
         cli.named(word)
 
 
-def test_help_names_every_command(capsys):
-    assert cli.main([]) == cli.main(["--help"]) == 0
-    said = capsys.readouterr().out
-    assert all(f"mvest {name}" in said for name in cli.COMMANDS)
+def test_help_lists_options_defaults_and_an_example(capsys):
+    assert cli.main([]) == 0
+    assert "mvest completion" in capsys.readouterr().out
+    for name in cli.COMMANDS:
+        with suppress(SystemExit):
+            cli.main([name, "--help"])
+        said = capsys.readouterr().out
+        assert f"example: mvest {name}" in said
+        assert max(map(len, said.splitlines())) <= 100, name
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["list"], ["own-valve", "--help"]])
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_the_completion_knows_the_words(shell, tmp_path, capsys):
+    assert cli.main(["completion", shell]) == 0
+    script = tmp_path / "script"
+    script.write_text(capsys.readouterr().out.removeprefix("autoload -U +X bashcompinit && "))
+    for words, expected in (
+        ("mvest ow", "own-valve"),
+        ("mvest run experiment=table1_te", "table1_tet4"),
+        ("mvest run -m sweep=noi", "noise"),
+        ("mvest import slicer", "slicerheart"),
+        ("mvest volume --ch", "--check"),
+    ):
+        *before, word = words.split(" ")
+        code = (
+            f"bashcompinit() {{ :; }}; source {script}; COMP_LINE='{words}' "
+            f"COMP_POINT={len(words)} COMP_WORDS=({words}) COMP_CWORD={len(before)}; "
+            "_mvest; echo ${COMPREPLY[@]}"
+        )
+        done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout.split() == [expected], word
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["list"], ["run", "--help"]])
 def test_words_alone_load_nothing(arguments, tmp_path):
     code = (
         "import sys\nfrom experiments.cli import main\n"
@@ -166,20 +173,6 @@ def test_a_reader_that_has_seen_enough_ends_the_list_quietly():
     )
     assert done.returncode in (0, 141)
     assert done.stderr == ""
-
-
-def test_too_small_an_address_space_is_one_line(tmp_path):
-    done = subprocess.run(
-        ["sh", "-c", f"ulimit -v 400000; exec {sys.executable} -m mvest run experiment=debug"],
-        cwd=tmp_path,
-        env=here(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert "ulimit -v" in line
 
 
 def here() -> dict[str, str]:

@@ -60,13 +60,6 @@ def test_code_beside_a_case_is_not_run(case, name):
     assert list(case.rglob("*.ran")) == []
 
 
-def test_a_process_finds_no_package_in_its_folder_by_an_empty_entry(case):
-    code = "from mvest.processes import *; run(python('mlflow', '--version'), env=environment())"
-    done = run(case, "-c", f"import os; os.environ['PYTHONPATH'] = ':.:'; {code}")
-    assert "mlflow" in done.stdout, done.stderr
-    assert list(case.rglob("*.ran")) == []
-
-
 def test_another_package_of_experiments_does_not_come_first(tmp_path):
     (tmp_path / "experiments.py").write_text(SPY)
     places = os.pathsep.join([str(tmp_path), str(ROOT)])

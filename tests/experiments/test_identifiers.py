@@ -18,7 +18,6 @@ from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality
 from mvest.provenance import write_json
 from tests.exchange import volume_variants
-from tests.exchange.volumes import volumes as v
 from tests.experiments.common.test_inputs import own_case, own_program, own_volume, typed
 from tests.experiments.configured import composed, plain
 from tests.made_up_closure import use
@@ -36,8 +35,10 @@ def philips(folder: Path) -> Path:
 
 def nrrd(folder: Path) -> Path:
     extra = f"# {NAME}\nPatientID:={NUMBER}\nPatientName:={NAME}\nStudyDate:={DATE}\n"
-    text = v.nrrd_text(v.nrrd_fields() | {"content": f'"{NAME}"'}, extra)
-    (folder / "a.nrrd").write_bytes(text + v.nrrd_voxels())
+    volume_variants.by_pynrrd(folder / "a.nrrd", "frames first", "raw", "uint8")
+    content = (folder / "a.nrrd").read_bytes()
+    fields = f'\ncontent: "{NAME}"\n{extra}\n'.encode()
+    (folder / "a.nrrd").write_bytes(content.replace(b"\n\n", fields, 1))
     return folder / "a.nrrd"
 
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import gzip
-import io
-import lzma
 import random
 import re
 import struct
-import zipfile
 import zlib
 from collections.abc import Callable
 
@@ -19,34 +16,22 @@ HEAD = 2048
 NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 WORD = re.compile(rb"[A-Za-z_][\w.-]*")
 SHORT_NUMBERS = (
-    "0 -1 1 2 -0 0.5 255 65536 1000000 1000000000 2147483647 2147483648 -2147483649 4294967295 "
-    "4294967296 1000000000000 9223372036854775807 9223372036854775808 18446744073709551616 1e200 "
-    "-1e200 1e309 1e-320 1e9999999999 nan NaN -inf Infinity 1_0 0x10 0o7 0b1 1:1 1:1:1:1 010 +5 1. "
-    ".5 1,5 true null ~ 1e --1 1j (1) ٣ １２ ½ −1"
+    "0 -1 2 0.5 255 1000000000 2147483648 4294967296 9223372036854775808 1e200 1e309 nan -inf "
+    "1_0 0x10 1:1 010 1. .5 1,5 true null --1 1j ٣ ½"
 )
-NUMBERS = [
-    *SHORT_NUMBERS.split(),
-    *("", "1 2", "1" + "0" * 400, "9" * 5000, "0." + "3" * 500),
-]
-SHORT_WORDS = (
-    r"null none NaN true False [] {} .. ../../x /etc/hostname /dev/zero C:\x %s%n {0} $HOME \ud800 "
-    r"\u0000 !!python/object:os.system &a *a << é"
-)
+NUMBERS = [*SHORT_NUMBERS.split(), "", "1 2", "1" + "0" * 400, "9" * 5000]
+SHORT_WORDS = "null NaN true [] {} ../../x /etc/hostname /dev/zero %s%n {0} &a *a << é !!python/x:y"
 WORDS = [
     *SHORT_WORDS.split(),
-    *("", " ", '""', "\0", "\x1b[31m", "\u202e", "\ufeff", "\r", "a" * 300, "a" * 40000),
-    *("[" * 5000, "{" * 5000, "- " * 5000, "<a>" * 5000, "((" * 3000),
+    *("\\ud800", "", "\0", "\x1b[31m", "\u202e", "\r", "a" * 40000),
+    *("[" * 5000, "- " * 5000, "<a>" * 5000),
 ]
-INTEGERS = [0, 1, 2, *(2**k - j for k in (7, 8, 15, 16, 31, 32, 40, 63, 64) for j in (0, 1))]
-REALS = [-0.0, 1e-38, 1e30, -1e38, float("inf"), float("-inf"), float("nan")]
+INTEGERS = [0, 1, 2, *(2**k - j for k in (7, 8, 15, 16, 31, 32, 63, 64) for j in (0, 1))]
 EXTREMES = [
-    *(struct.pack(order + form, x) for x in REALS for order in "<>" for form in "fd"),
-    *(n.to_bytes(k, "little") for n in INTEGERS for k in (2, 4, 8) if n < 256**k),
-    *(n.to_bytes(k, "big") for n in INTEGERS for k in (2, 4, 8) if n < 256**k),
-]
-ENCODINGS = ["utf-16", "utf-16-le", "utf-32", "utf-8-sig", "cp037", "utf-7"]
-BROKEN = (OSError, EOFError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error,
-          lzma.LZMAError)  # fmt: skip
+    *(struct.pack("<f", x) for x in (1e30, float("inf"), float("nan"))),
+    *(n.to_bytes(k, o) for n in INTEGERS for k in (2, 4, 8) for o in ("little", "big")
+      if n < 256**k),
+]  # fmt: skip
 
 
 def place(content: bytes, draw: random.Random) -> int:
@@ -125,35 +110,19 @@ def line(content: bytes, draw: random.Random) -> bytes:
     return b"\n".join(lines)
 
 
-def encoding(content: bytes, draw: random.Random) -> bytes:
-    return content.decode("latin-1").encode(draw.choice(ENCODINGS), errors="replace")
-
-
 def inside(content: bytes, draw: random.Random) -> bytes:
-    """A change of what is compressed in a gzip or zip file, with checksums that are right."""
+    """A change of what is compressed in a gzip file, with a checksum that is right."""
     change = draw.choice(CHANGES)
     try:
-        if content[:2] == b"\x1f\x8b":
-            return gzip.compress(change(gzip.decompress(content), draw), 1)
-        if content[:2] != b"PK":
-            return change(content, draw)
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = {item: archive.read(item) for item in archive.namelist()}
-    except BROKEN:
-        return content
-    chosen = draw.choice(sorted(members)) if members else "x"
-    members[chosen] = change(members.get(chosen, b""), draw)
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", draw.choice((0, 8, 12, 14))) as archive:
-        for item, data in members.items():
-            archive.writestr(item or "x", data)
-    return packed.getvalue()
+        return gzip.compress(change(gzip.decompress(content), draw), 1)
+    except (OSError, EOFError, zlib.error):
+        return change(content, draw)
 
 
 CHANGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
-    *(bits, number, word, line, extreme, removal, splice, run, encoding),
+    *(bits, number, word, line, extreme, removal, splice, run),
 )
-WEIGHTS = [1, 4, 3, 1, 4, 2, 1, 0.5, 0.3, 4]
+WEIGHTS = [1, 4, 3, 1, 4, 2, 1, 0.5, 4]
 
 
 def changed(content: bytes, draw: random.Random) -> bytes:

@@ -24,8 +24,3 @@ def test_settings_that_are_named_exist(path, parts):
         named = set(re.findall(rf"(?<![\w./]){part}\.(\w+)\b", text)) - {"md"}
         assert named, part
         assert named <= {f.name for f in fields(SETTINGS[part])}
-
-
-def test_local_links_lead_somewhere():
-    for target in re.findall(r"\]\((?!https?:|#)([^)#]+)\)", OWN.read_text(encoding="utf-8")):
-        assert (OWN.parent / target).exists(), target

@@ -95,7 +95,7 @@ def test_every_landmark_is_where_its_name_says():
 
 @pytest.mark.parametrize("direction", [ROTATION, MIRRORED])
 def test_a_step_along_an_axis_of_a_volume_is_its_column_times_its_spacing(direction):
-    # Rows taken for columns, or the spacing of another axis, are seen here.
+    # Rows taken for columns, or the spacing of another axis, fail here.
     grey, spacing = np.zeros((1, 3, 4, 5), np.uint8), np.array([0.5, 1.0, 2.0])
     v = VolumeSequence(grey, spacing, direction, np.array([10.0, -20.0, 30.0]), np.zeros(1))
     np.testing.assert_allclose(v.world(np.zeros(3)), v.origin)

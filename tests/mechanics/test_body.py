@@ -7,9 +7,8 @@ import pytest
 
 import mvest.mechanics
 import mvest.mechanics.body
-from mvest.errors import GeometryError, InputError, MaterialError, MvestError
+from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.mechanics import Parameter, TransverselyIsotropic, box, outer_faces, simulate_body
-from mvest.mechanics.solver import linear_solver
 from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, SaintVenantKirchhoff
 
 RUBBER = TransverselyIsotropic.isotropic(2.0, 0.45)
@@ -20,12 +19,6 @@ def test_the_documented_examples_run_as_shown(module):
     outcome = doctest.testmod(module)
     assert outcome.attempted > 5
     assert outcome.failed == 0
-
-
-def test_the_documented_example_has_ten_lines():
-    parts = doctest.DocTestParser().get_examples(mvest.mechanics.__doc__)
-    statements = [p for p in parts if not p.source.startswith(("import", "from"))]
-    assert len(statements) <= 10
 
 
 def arguments(element_type="hex18"):
@@ -43,8 +36,10 @@ def arguments(element_type="hex18"):
     }
 
 
-@pytest.mark.parametrize("element_type", ELEMENT_NAMES)
-@pytest.mark.parametrize("material", ["isotropic", "A"])
+@pytest.mark.parametrize(
+    ("element_type", "material"),
+    [(name, "isotropic" if k % 2 else "A") for k, name in enumerate(ELEMENT_NAMES)],
+)
 def test_every_element_inflates_a_sheet_with_every_material(element_type, material):
     given = arguments(element_type)
     fibre = None if material == "isotropic" else (1.0, 0.0, 0.0)
@@ -60,13 +55,6 @@ def test_every_element_inflates_a_sheet_with_every_material(element_type, materi
     assert 0 < lift[1] < lift[2]
 
 
-def test_the_direction_of_the_fibre_does_not_matter_to_an_isotropic_material():
-    given = arguments()
-    free = simulate_body(**given).frames
-    turned = simulate_body(**given, fibre=(0.6, 0.8, 0.0)).frames
-    np.testing.assert_allclose(free, turned, atol=1e-8)
-
-
 def test_two_materials_and_their_parameters():
     given = arguments()
     region = (np.arange(len(given["elements"])) < 4).astype(int)
@@ -78,15 +66,6 @@ def test_two_materials_and_their_parameters():
     assert result.sensitivities.shape == (3, 2, len(given["nodes"]), 3)
     # Stiffer means less lifted, in either half.
     assert np.all(result.sensitivities[-1, :, :, 2].sum(axis=1) < 0)
-
-
-def test_pressure_as_number_table_and_function_agree():
-    given = arguments()
-    number = simulate_body(**given).frames
-    table = simulate_body(**(given | {"pressure": [(0.0, 0.01), (1.0, 0.01)]})).frames
-    function = simulate_body(**(given | {"pressure": lambda t: 0.01})).frames
-    np.testing.assert_array_equal(number, table)
-    np.testing.assert_array_equal(number, function)
 
 
 def test_forces_as_numbers_and_as_a_function_agree_and_are_borne_by_what_is_held():
@@ -168,38 +147,17 @@ def test_a_law_of_ones_own_takes_the_place_of_the_material(static):
     assert np.abs(own.sensitivities[-1]).max() > 1e-2
 
 
-def test_the_result_says_what_has_solved():
-    for solver in ("pardiso", "superlu"):
-        if solver == "pardiso" and linear_solver().name != "pardiso":
-            continue
-        result = simulate_body(**arguments(), solver=solver)
-        assert result.solver == solver
-        assert f"solved by {solver}" in str(result)
-
-
 GOOD = arguments()
 NODES, ELEMENTS, FACES = GOOD["nodes"], GOOD["elements"], GOOD["pressure_faces"]
 FIBROUS = TransverselyIsotropic(2.0, 1.0, 0.5, 0.3, 0.3)
-NAN_NODES, BAD_ELEMENTS = NODES.copy(), ELEMENTS.copy()
-NAN_NODES[3, 1] = np.nan
-BAD_ELEMENTS[1, 2] = len(NODES)
 BAD = [
     ({"nodes": NODES[:, :2]}, InputError, "nodes: shape"),
-    ({"nodes": NAN_NODES}, InputError, "nodes.*finite"),
     ({"element_type": "hex8"}, InputError, "unknown element 'hex8'; known elements: tet4"),
     ({"elements": ELEMENTS[:, :8]}, InputError, r"elements: shape \(9, 8\), expected \(None, 18\)"),
-    ({"elements": ELEMENTS[:0]}, InputError, "the mesh has no elements"),
-    ({"elements": BAD_ELEMENTS}, InputError, "98|97"),
-    ({"elements": ELEMENTS + 0.5}, InputError, "integer"),
     ({"nodes": NODES * [1, 1, -1]}, GeometryError, "inverted elements; the worst is element"),
-    ({"nodes": np.vstack([NODES, [[0, 0, 9.0]]])}, GeometryError, "belongs to no element"),
     ({"fixed_nodes": [0, len(NODES)]}, InputError, r"fixed_nodes: entry .* expected 0 to"),
-    ({"fixed_nodes": [-1]}, InputError, r"fixed_nodes: entry .* expected 0 to"),
-    ({"fixed_nodes": [0.5]}, InputError, "fixed_nodes.*integers"),
-    ({"pressure_faces": FACES + len(NODES)}, InputError, "pressure_faces"),
-    ({"pressure_faces": FACES[:, :4]}, InputError, "pressure_faces"),
     (
-        {"pressure_faces": np.roll(FACES, 2, axis=0) * 0 + np.arange(9) * 3},
+        {"pressure_faces": FACES * 0 + np.arange(9) * 3},
         GeometryError,
         "is not a face of an element",
     ),
@@ -208,29 +166,17 @@ BAD = [
         GeometryError,
         "points into the solid; reverse its node order",
     ),
-    ({"times": [0.1, 0.1]}, InputError, "time steps must increase strictly"),
     ({"times": [[0.1, 0.2]]}, InputError, r"times: shape \(1, 2\)"),
     ({"pressure": float("nan")}, InputError, "pressure table .* is not finite"),
-    ({"pressure": [0.0, 0.1, 0.2]}, InputError, r"pressure table .* shape \(3,\)"),
     ({"pressure": [(0.1, 0.0), (0.0, 0.1)]}, InputError, "increasing times"),
-    (
-        {"fixed_components": np.zeros((3, 3), dtype=bool)},
-        InputError,
-        r"fixed_components: shape \(3, 3\)",
-    ),
     ({"fixed_components": np.zeros(NODES.shape)}, InputError, "fixed_components.* of bool"),
-    ({"forces": (0.0, 0.0, 1.0)}, InputError, r"forces: shape \(3,\), expected \(98, 3\)"),
     ({"forces": lambda t: np.full(NODES.shape, np.inf)}, InputError, r"forces at t = 0.05 s"),
     ({"material": saint_venant(2.0)}, InputError, "fibre is needed"),
-    ({"material": FIBROUS}, InputError, "fibre is needed"),
     ({"material": FIBROUS, "fibre": (0, 0, 0)}, InputError, "fibre has a length of zero"),
     ({"material": FIBROUS, "fibre": (0, 0, 1)}, InputError, "no direction within the leaflet"),
-    ({"material": FIBROUS, "fibre": [(1, 0, 0), (0, 1, 0)]}, InputError, "fibre"),
     ({"material": [RUBBER, RUBBER]}, InputError, "2 materials need the region"),
     ({"region": np.full(len(ELEMENTS), 1)}, InputError, "region"),
-    ({"region": [0]}, InputError, "region"),
-    ({"material": []}, MaterialError, "material must be"),
-    ({"material": 2.0}, MvestError, "material must be"),
+    ({"material": 2.0}, MaterialError, "material must be"),
     ({"density": 0.0}, InputError, "density 0.0 t/mm"),
     ({"solver": "cholmod"}, InputError, "unknown linear solver 'cholmod'"),
     ({"parameters": [Parameter("E_f.septal", 1.0)]}, InputError, "unknown region"),
@@ -241,9 +187,3 @@ BAD = [
 def test_bad_input_gives_one_clear_error(changes, kind, message):
     with pytest.raises(kind, match=message):
         simulate_body(**(GOOD | changes))
-
-
-@pytest.mark.parametrize(("cells", "size"), [((0, 1, 1), (1, 1, 1)), ((1, 1, 1), (1, -1, 1))])
-def test_a_box_needs_cells_and_a_size(cells, size):
-    with pytest.raises(InputError, match="box of"):
-        box("tet4", cells, size)

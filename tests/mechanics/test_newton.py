@@ -1,14 +1,11 @@
 """Newton's method: quadratic where it converges, a value with a reason where it does not."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from mvest.errors import InputError
 from mvest.mechanics import (
     BiotLaw,
-    Damping,
     Loads,
     NewtonSettings,
     Parameter,
@@ -25,7 +22,6 @@ from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.solid import Solid
-from mvest.mechanics.steps import Simulation, StepRecord
 from tests.mechanics.bodies import MATERIALS, block, sandwich
 
 
@@ -58,8 +54,9 @@ def assert_quadratic(residuals):
     return len(small)
 
 
-@pytest.mark.parametrize("element_type", ["hex18", "tet10", "wedge12"])
-@pytest.mark.parametrize("static", [False, True])
+@pytest.mark.parametrize(
+    ("element_type", "static"), [("hex18", False), ("hex18", True), ("tet10", False)]
+)
 def test_newton_converges_quadratically(element_type, static):
     # Without the load stiffness, the rotation derivative or the Schur complement of the enhanced
     # strain convergence is linear.
@@ -119,45 +116,6 @@ def test_the_last_correction_is_part_of_the_solution(parameters):
     np.testing.assert_allclose(rough.frames[-1], exact, rtol=0, atol=1e-8)
 
 
-def test_the_tangent_is_made_of_accepted_states_only(monkeypatch):
-    counts = {"evaluate": 0, "tangent": 0}
-
-    def counted(name):
-        true = getattr(System, name)
-
-        def call(self, *arguments, **options):
-            counts[name] += 1
-            return true(self, *arguments, **options)
-
-        return call
-
-    for name in counts:
-        monkeypatch.setattr(System, name, counted(name))
-    system, loading = sandwich(cells=2, samples=11)
-    result = simulate(system, loading, [Step(0.1)], parameters=[Parameter("E_f.upper", 0.5)])
-    assert result.converged
-    # One for each iteration and one for the derivatives, whatever the line search tries.
-    assert counts["tangent"] == result.iterations + 1 < counts["evaluate"]
-
-
-def test_an_expected_move_is_followed_as_far_as_contact_admits():
-    # Expected five millimetres below the other sheet, the upper one stops on it.
-    system, loading = sandwich(cells=2, samples=11)
-    closed = simulate(system, loading, [Step(0.06), Step(1.0, static=True)], final_only=True)
-    move = np.zeros_like(closed.frames[-1])
-    move[closed.frames[0][:, 2] > 1.5] = [0.0, 0.0, -5.0]
-    start = {"initial_positions": closed.frames[-1], "initial_time": 1.0}
-    seen = []
-    true_evaluate = system.evaluate
-    system.evaluate = lambda x, *a, **k: seen.append(x) or true_evaluate(x, *a, **k)
-    again = simulate(system, loading, [Step(2.0, static=True)], initial_move=move, **start)
-    assert again.converged
-    expected = (seen[0] - closed.frames[-1])[move[:, 2] < 0, 2]
-    assert -5.0 < expected.min() < -1e-3
-    np.testing.assert_allclose(expected[expected < -1e-12], expected.min(), rtol=1e-9)
-    np.testing.assert_allclose(again.frames[-1], closed.frames[-1], rtol=0, atol=1e-8)
-
-
 @pytest.mark.parametrize("always", [False, True])
 def test_a_step_that_ends_intersecting_is_repeated_with_detection(monkeypatch, always):
     true_step, true_intersects, detected = Contact.largest_step, Contact.intersects, []
@@ -214,14 +172,6 @@ def test_loads_that_are_not_numbers_end_the_run_with_a_reason():
     assert np.isfinite(result.frames).all()
 
 
-def test_a_body_without_support_has_no_static_equilibrium():
-    # Six rigid motions without stiffness: the loads are not in balance, so there is no solution.
-    newton = NewtonSettings(max_iterations=5, max_halvings=2)
-    result = sheet(static=True, fixed_nodes=[], newton=newton)
-    assert not result.converged
-    assert len(result.frames) == 1
-
-
 def test_a_failed_step_leaves_nothing_behind(monkeypatch):
     # A wild iterate may send the enhanced strains far off; the halved step must not start there.
     true_evaluate, calls = Solid.evaluate, []
@@ -245,59 +195,10 @@ def test_a_failed_step_leaves_nothing_behind(monkeypatch):
     np.testing.assert_allclose(disturbed.frames[-1], undisturbed.frames[-1], atol=0.05 * largest)
 
 
-def test_failing_steps_are_halved_and_the_frames_stay_at_the_asked_times():
-    settings = NewtonSettings(max_iterations=4, max_halvings=8)
-    times = [0.03, 0.06]
-    result = sheet(times=times, pressure=[(0.0, 0.0), (0.06, 0.1)], newton=settings)
-    assert result.converged
-    assert max(r.halvings for r in result.records) > 0
-    assert result.times.tolist() == [0.0, *times]
-    # The substeps fill the steps without gap or overlap.
-    assert sum(r.dt for r in result.records) == pytest.approx(0.06, rel=1e-12)
-    np.testing.assert_allclose(np.cumsum([r.dt for r in result.records])[-1], result.times[-1])
-
-
-def test_single_solve_takes_one_linear_solve_per_step():
-    # Near the converged run, but not on it.
-    single = sheet(newton=NewtonSettings(single_solve=True))
-    exact = sheet()
-    assert single.converged
-    assert all(len(r.residuals) == 2 for r in single.records)
-    distance = np.abs(single.frames[-1] - exact.frames[-1]).max()
-    assert 1e-6 < distance < 0.5
-
-
-def test_progress_is_reported_after_each_step():
-    mesh = block("hex18", (2, 1, 1))
-    system = System(Solid(mesh, BiotLaw.of((MATERIALS["A"],))), fixed_nodes=np.arange(3))
-    seen = []
-    simulate(
-        system,
-        lambda t: Loads(fixed=mesh.nodes[:3]),
-        [Step(0.1), Step(0.2)],
-        on_step=lambda t, n: seen.append((t, n)),
-    )
-    assert [t for t, _ in seen] == [0.1, 0.2]
-
-
-@pytest.mark.parametrize("times", [[], [0.0], [0.1, 0.1], [0.2, 0.1], [-1.0], [0.1, float("nan")]])
+@pytest.mark.parametrize("times", [[], [0.0], [0.2, 0.1], [0.1, float("nan")]])
 def test_times_must_increase_from_zero(times):
     with pytest.raises(InputError, match="time steps must increase"):
         sheet(times=times)
-
-
-@pytest.mark.parametrize(
-    "settings", [{"tolerance": 0.0}, {"max_iterations": 0}, {"max_halvings": -1}]
-)
-def test_inadmissible_newton_settings(settings):
-    with pytest.raises(InputError, match="Newton settings"):
-        NewtonSettings(**settings)
-
-
-@pytest.mark.parametrize("settings", [{"alpha": -1.0}, {"beta": float("nan")}])
-def test_inadmissible_damping(settings):
-    with pytest.raises(InputError, match="damping"):
-        Damping(**settings)
 
 
 def test_an_equilibrium_that_is_not_found_is_tried_again_after_a_rest(monkeypatch):
@@ -338,33 +239,14 @@ def test_an_equilibrium_that_is_not_found_is_tried_again_after_a_rest(monkeypatc
         )
 
 
-def test_an_equilibrium_that_is_never_found_is_a_failure(monkeypatch):
-    true_step = integrate._Stepper._step
+def test_iterates_that_run_away_and_detection_without_memory_fail_the_step(monkeypatch):
+    class NoMemory:
+        def largest_step(self, pairs, y, dy, *, detect):
+            raise MemoryError("std::bad_alloc")
 
-    def step(self, state, end, dt, static):
-        if static:
-            raise integrate._StepError(StepReason.NO_CONVERGENCE)
-        return true_step(self, state, end, dt, static)
-
-    monkeypatch.setattr(integrate._Stepper, "_step", step)
-    result = sheet(static=True)
-    assert result.reason is StepReason.NO_CONVERGENCE
-    assert len(result.times) == 1
-
-
-def test_a_simulation_prints_how_it_went():
-    # Two steps of 3 and 2 residuals, the last of which is after the last iteration.
-    records = tuple(
-        StepRecord(t, 0.1, residuals, 0, 0)
-        for t, residuals in ((0.1, (1.0, 1e-3, 1e-9)), (0.2, (1.0, 1e-9)))
-    )
-    frames = np.zeros((3, 7, 3))
-    done = Simulation(
-        np.array([0.0, 0.1, 0.2]), frames, np.zeros((3, 2, 7, 3)), StepReason.COMPLETED, records
-    )
-    assert str(done) == (
-        "completed at t = 0.2 s: 3 frames of 7 nodes, 2 sensitivities; 2 steps, 3 Newton iterations"
-    )
-    assert str(replace(done, reason=StepReason.SINGULAR)).startswith(
-        "the tangent could not be factorised at t = 0.2 s"
-    )
+    with pytest.raises(integrate._StepError):
+        integrate._largest_step(NoMemory(), None, np.zeros((1, 3)), np.ones((1, 3)), detect=False)
+    # The limit is on the iterations of one step: a body that may not move at all bends nowhere.
+    monkeypatch.setattr(integrate, "RUNAWAY", 1e-4)
+    halving = NewtonSettings(max_halvings=0)
+    assert sheet(newton=halving).reason is StepReason.NO_CONVERGENCE

@@ -8,7 +8,6 @@ from mvest.mechanics.parameters import (
     Parameter,
     is_positive,
     kind_of,
-    known_names,
 )
 
 
@@ -39,9 +38,3 @@ def test_only_coefficients_of_a_field_may_be_negative():
 def test_what_is_no_name_is_told_the_known_ones(name):
     with pytest.raises(InputError, match=r"known: E_f\.REGION, field\.REGION\.K"):
         kind_of(name)
-
-
-def test_names_say_whether_they_need_a_part():
-    # The factors of chordae are for all of them, or for some; a modulus is always of a region.
-    known = known_names(("E_f", "chord_stiffness", "damping"))
-    assert known == "E_f.REGION, chord_stiffness, chord_stiffness.FAMILY or tipN, damping"

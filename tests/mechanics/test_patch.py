@@ -39,7 +39,7 @@ def patch(mesh, material):
 
 
 @pytest.mark.parametrize("element_type", ELEMENT_NAMES)
-@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("material", ["isotropic", "C"])
 def test_affine_displacement_is_reproduced_on_a_distorted_mesh(element_type, material):
     # Inner nodes solved for from the boundary must lie on the affine map, and the stress be
     # constant. Layered elements keep the fibre within the layer, so only tetrahedra and the
@@ -56,12 +56,10 @@ def test_affine_displacement_is_reproduced_on_a_distorted_mesh(element_type, mat
 
 
 @pytest.mark.parametrize("element_type", ELEMENT_NAMES)
-@pytest.mark.parametrize("angle", [90, 180])
-@pytest.mark.parametrize("material", ["A", "C"])
-def test_rigid_rotation_gives_no_force(element_type, angle, material):
+def test_rigid_rotation_gives_no_force(element_type):
     mesh = block(element_type, fibre=(0.8, 0.6, 0), distortion=(0.2, 0.2, 0.2))
-    solid = Solid(mesh, BiotLaw.of((MATERIALS[material],)))
-    x = mesh.nodes @ rotation((1, 2, -1), np.deg2rad(angle)).T + [3.0, -2.0, 5.0]
+    solid = Solid(mesh, BiotLaw.of((MATERIALS["C"],)))
+    x = mesh.nodes @ rotation((1, 2, -1), np.pi).T + [3.0, -2.0, 5.0]
     state = solid.evaluate(x, solid.initial_strain(), 10.0)
     # Round-off of F^T F is 1e-15; damping multiplies it by 1 + 10, then come the stiffness (about
     # 45 MPa for C) and areas of mm^2.
@@ -80,7 +78,7 @@ def test_rigid_rotation_of_a_deformed_body_turns_its_forces(element_type):
     np.testing.assert_allclose(there, here @ q.T, atol=1e-12 * np.abs(here).max() + 1e-13)
 
 
-@pytest.mark.parametrize("element_type", ELEMENT_NAMES)
+@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
 def test_rigid_rotation_between_two_steps_dissipates_nothing(element_type):
     # Damping acts on the rate of the Biot strain, which a rotation of the deformed body leaves
     # alone: with the strain of the start of the step as history the damped force is the elastic

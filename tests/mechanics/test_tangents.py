@@ -10,7 +10,7 @@ import pytest
 
 from mvest.mechanics.assembly import SparsityPattern, add_forces, adjacency
 from mvest.mechanics.body import outer_faces
-from mvest.mechanics.forces.cables import Cables, Hinge
+from mvest.mechanics.forces.cables import Cables
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.solid import Solid
@@ -63,8 +63,7 @@ def moved(mesh, amount=0.08, seed=1):
 
 
 @pytest.mark.parametrize("element_type", ELEMENT_NAMES)
-@pytest.mark.parametrize("rate", [0.0, 10.0], ids=["elastic", "damped"])
-@pytest.mark.parametrize("material", ["A", "C"])
+@pytest.mark.parametrize(("rate", "material"), [(0.0, "C"), (10.0, "A")])
 def test_material(element_type, rate, material):
     mesh = block(element_type, (2, 2, 1), fibre=(0.8, 0.6, 0), distortion=(0.2, 0.2, 0.2))
     system = System(Solid(mesh, BiotLaw.of((MATERIALS[material],))))
@@ -130,13 +129,6 @@ def test_chords(rest):
     check_system(system, x, Loads(tips=tips))
 
 
-def test_hinge():
-    mesh, solid = soft_block()
-    points = embed(mesh, np.array([[0.0, 1.0, 1.0], [0.0, 2.0, 1.0]]))
-    hinge = Hinge(points, np.array([50.0, 20.0]))
-    check_system(System(solid, hinge=hinge), moved(mesh), Loads(hinge=points(mesh.nodes)))
-
-
 def pressed(system, loading, seed=3):
     """Positions in which the two sheets are bulged into contact, and the candidate pairs."""
     nodes = system.solid.mesh.nodes
@@ -174,7 +166,7 @@ def test_contact_between_neighbours():
     check_system(alone, x, Loads(), pairs=pairs)
 
 
-@pytest.mark.parametrize("element_type", ["hex18", "tet10", "wedge18"])
+@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
 def test_all_together(element_type):
     system, loading = sandwich(element_type=element_type, samples=9)
     x, pairs = pressed(system, loading)

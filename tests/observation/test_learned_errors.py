@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
-from mvest.estimation import Gaussian, IteratedFilter, Prediction, observation_noise
+from mvest.estimation import Gaussian, IteratedFilter, Prediction
 from mvest.estimation.noise import NoiseFamily
 from mvest.estimation.spectrum import matern
 from mvest.observation.learned import CURVES, ROUGH, ErrorBeliefs, error_family
@@ -79,24 +79,6 @@ def surface_observation(height: FloatArray, curve: FloatArray) -> SurfaceObserva
     )
     surface = PredictedSurface.refined(POINTS, TRIANGLES, leaflet, border, 2.0, 1.0)
     return SurfaceObservation((seen,), surface, 0.5)
-
-
-def test_points_of_different_leaflets_and_curves_are_independent() -> None:
-    observation = surface_observation(np.zeros(N), np.zeros((4 * SIDE - 4, 3)))
-    family = error_family(observation, BELIEFS, 8.0)
-    assert family.size == len(observation.y)
-    assert set(family.quantities) == {ROUGH, CURVES}
-    points = observation.seen[0]
-    R, q = covariance(family), len(points.points)
-    other = points.region[:, None] != points.region
-    assert np.abs(R[:q, :q][other]).max() < 1e-3 * 0.25
-    near = ~other & (cdist(points.points, points.points) < 2.0)
-    assert R[:q, :q][near].min() > 0.1
-    assert np.abs(R[:q, q:]).max() < 1e-12
-    np.testing.assert_allclose(np.diag(R)[q:], 0.25 + BELIEFS.resolution_mm**2)
-    assert observation_noise(family, family.size).log_determinant == pytest.approx(
-        np.linalg.slogdet(R)[1], rel=1e-9
-    )
 
 
 def test_a_filter_learns_the_errors_of_distances_and_of_curves() -> None:

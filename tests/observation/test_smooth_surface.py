@@ -74,25 +74,6 @@ def test_derivatives_are_those_of_differences_everywhere():
     assert coarse / fine == pytest.approx(16.0, rel=0.3)
 
 
-def test_points_of_the_surface_are_on_it():
-    drawn = FINE.drawn(REST)
-    bend = smooth_distances(drawn[::28], drawn, FINE.triangles, 0.5)[0]
-    assert np.sqrt(np.mean(bend**2)) < 0.03
-    up, down = (
-        smooth_distances(points, drawn, FINE.triangles, 0.5)[0]
-        for points in (normals(drawn, 0.8), normals(drawn, -0.8))
-    )
-    assert np.median(up) == pytest.approx(0.8, abs=0.03)
-    assert np.median(down) == pytest.approx(-0.8, abs=0.03)
-
-
-def normals(drawn, height):
-    """Points above the middles of every 200th triangle."""
-    a, b, c = drawn[FINE.triangles[::200]].transpose(1, 0, 2)
-    n = np.cross(b - a, c - a)
-    return (a + b + c) / 3 + height * n / np.linalg.norm(n, axis=1)[:, None]
-
-
 def test_beyond_a_border_the_surface_goes_on():
     # A square in the plane z = 0: nothing happens where a point passes its border.
     x, y = (v.ravel() for v in np.meshgrid(*2 * (np.linspace(0, 5, 26),)))

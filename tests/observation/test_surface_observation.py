@@ -8,8 +8,6 @@ import pytest
 
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import (
-    Gaussian,
-    IteratedFilter,
     Prediction,
     observation_noise,
 )
@@ -132,20 +130,6 @@ def test_a_plane_moved_along_its_normal_gives_the_shift_whatever_the_sampling(
         )
 
 
-def test_points_that_slide_within_the_surface_change_nothing() -> None:
-    vertices, surface = plane()
-    height = rng(3).normal(size=60)
-    results = []
-    for seed in (1, 2):
-        points = scattered(60, height, seed)
-        predict = SurfaceObservation((seen(points),), surface, 0.5).of(model(translated(vertices)))
-        # The tissue sliding under the points does not either.
-        results += [predict(np.array([x, -0.4, 0.3])) for x in (0.0, 0.8)]
-    for result in results:
-        np.testing.assert_allclose(result.y, height - 0.3, atol=1e-14)
-        np.testing.assert_allclose(result.jacobian, [[0.0, 0.0, -1.0]] * 60, atol=1e-14)
-
-
 def test_a_point_belongs_to_its_own_leaflet_even_where_another_is_nearer() -> None:
     # Two parallel leaflets 2 mm apart, facing each other; a point 0.5 mm above the lower one.
     vertices, triangles = grid(4, 4)
@@ -188,39 +172,6 @@ def test_a_curve_is_compared_across_and_not_along() -> None:
     along = np.column_stack([-np.sin(s), np.cos(s), np.zeros(60)])
     expected = np.eye(3) - along[:, :, None] * along[:, None, :]
     np.testing.assert_allclose(across, expected, atol=0.02)
-
-
-# --- through the filters ------------------------------------------------------------------------
-
-
-def test_three_perpendicular_faces_are_textbook_least_squares() -> None:
-    # Each point of a face tells of one coordinate of a translation, linearly, so that the posterior
-    # is that of a linear model in closed form; the filters have to agree in one step.
-    vertices, triangles = grid(4, 4)
-    turns = [np.eye(3), np.roll(np.eye(3), 1, axis=1), np.roll(np.eye(3), 2, axis=1)]
-    corner = np.concatenate([vertices @ turn for turn in turns])
-    surface = surface_of(
-        corner,
-        np.concatenate([triangles + k * len(vertices) for k in range(3)]),
-        np.repeat([0, 1, 2], len(triangles)),
-    )
-    normals = np.array([[0, 0, 1.0] @ turn for turn in turns])
-    truth, std = np.array([0.4, -0.3, 0.2]), 0.5
-    points, region = [], np.repeat([0, 1, 2], [10, 20, 30])
-    for k, count in enumerate((10, 20, 30)):
-        height = std * rng(k).normal(size=count)
-        points.append(scattered(count, height, k) @ turns[k] + truth)
-    points = np.concatenate(points)
-    prior = Gaussian.from_variance(np.array([0.1, 0.0, 0.0]), 0.2)
-    observation = SurfaceObservation((seen(points, region),), surface, std)
-    predict = observation.of(model(translated(corner)))
-    found = IteratedFilter()(predict, prior, observation.y, observation.R)
-
-    A = normals[region]
-    P = np.linalg.inv(A.T @ A / std**2 + np.eye(3) / 0.2)
-    mean = P @ (A.T @ np.einsum("qk,qk->q", A, points) / std**2 + prior.mean / 0.2)
-    np.testing.assert_allclose(found.mean, mean, atol=1e-12)
-    np.testing.assert_allclose(found.covariance, P, atol=1e-12)
 
 
 # --- noise --------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""A closed frame whose vertices are others than those of the model, by a real closure."""
+"""A closed frame without correspondence, by a real closure."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -50,7 +50,7 @@ def test_moduli_come_back_from_a_true_surface_with_other_vertices():
     apart = replace(case, frames=(case.frames[0], closed), uncertainty=Uncertainty(0.5, 10.0))
     result = personalise(apart, SETTINGS).result
     assert result.converged, str(result)
-    # Of facets it was 1.9 after 15 iterations, which did not end.
+    # Compared with facets, 15 iterations did not converge.
     assert result.filtered.check.holds
     for name, true in TRUE.items():
         k = result.parameters.index(name)

@@ -1,4 +1,4 @@
-"""Designs of frames and pressures: they are what an estimation from such frames expects."""
+"""Designs of frames and pressures: they equal what an estimation from such frames expects."""
 
 from dataclasses import replace
 
@@ -11,7 +11,15 @@ from mvest.personalisation import PressureErrors, design_case, expect_case
 from mvest.personalisation.design import ERRORS_MMHG, KINDS, errors_of
 from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
 from mvest.personalisation.known import REACH
-from tests.made_up_closure import FIELDS, PRESSURE, made_up_case, settings, unknowns, use
+from tests.made_up_closure import (
+    FIELDS,
+    PRESSURE,
+    error_source,
+    made_up_case,
+    settings,
+    unknowns,
+    use,
+)
 
 STATED = PressureErrors(offset_mmHg=4.0, each_mmHg=3.0)
 CASE = made_up_case(std_mm=0.6, correlation_length_mm=10.0)
@@ -20,40 +28,30 @@ CASE = made_up_case(std_mm=0.6, correlation_length_mm=10.0)
 @pytest.fixture
 def designs(monkeypatch):
     use(monkeypatch)
-    found = design_case(CASE, settings(pressures=STATED))
-    assert not isinstance(found, str)
-    return found
-
-
-def held(pressures):
-    """The case with frames as a design has them: held as the closed one is."""
-    open_, closed, *_ = CASE.frames
-    fitted = [
-        replace(closed, name=f"{p:g}", role=Role.FITTED, time=closed.time + k, pressure_mmHg=p)
-        for k, p in enumerate(pressures, start=1)
-    ]
-    return replace(CASE, frames=(open_, closed, *fitted))
-
-
-def log_std(unknown):
-    """Of a positive unknown, from its interval."""
-    return np.log(unknown["high"] / unknown["low"]) / (2 * REACH)
+    return design_case(CASE, settings(pressures=STATED))
 
 
 def test_a_design_is_what_an_estimation_of_these_frames_expects(designs):
     assert designs.pressures_mmHg == (100.0, 87.5, 75.0, 62.5, 50.0)
     assert designs.chosen(3) == (0, 2, 4)
-    expected = expect_case(held((75.0, 50.0)), settings(pressures=STATED))
-    bound = designs.at(3)
-    std = dict(zip(bound.names, bound.std, strict=True))
-    for unknown in expected.unknowns[:5]:
+    open_, closed, *_ = CASE.frames
+    fitted = [
+        replace(closed, name=f"{p:g}", role=Role.FITTED, time=closed.time + k, pressure_mmHg=p)
+        for k, p in enumerate((75.0, 50.0), start=1)
+    ]
+    case = replace(CASE, frames=(open_, closed, *fitted))
+
+    def log_std(unknown):
+        return np.log(unknown["high"] / unknown["low"]) / (2 * REACH)
+
+    std = designs.std(3)
+    for unknown in expect_case(case, settings(pressures=STATED)).unknowns[:5]:
         assert std[unknown["name"]] == pytest.approx(log_std(unknown), rel=1e-6)
-    # Known pressures are those of an estimation that takes them as they are.
+    # Known pressures are those of an estimation without errors of pressures.
     calibrated = [replace(u, std=0.02) if u.name == SCALE else u for u in unknowns()]
-    known = expect_case(held((75.0, 50.0)), settings(*calibrated))
+    known = expect_case(case, settings(*calibrated))
     left = designs.left(3, {"factor": 0.02, "offset": 0.0, "each": 0.0})
     for name, unknown in zip(left, known.unknowns, strict=False):
-        assert unknown["name"] == name
         assert left[name] == pytest.approx(log_std(unknown) / designs.knowledge[name], rel=1e-6)
 
 
@@ -63,14 +61,14 @@ def test_frames_and_knowledge_only_help(designs):
             [sum(designs.left(n, errors_of(kind, e, 100.0)).values()) for n in (1, 2, 5)]
             for e in ERRORS_MMHG
         ]
+        # One and two frames are among all five.
         assert np.all(np.diff(table, axis=1) <= 1e-9)
-        # Two frames out of five need not be among three, but one and two are among all.
         assert np.all(np.diff(table, axis=0) >= -1e-9)
     assert sum(designs.left(2, known=(SCALE,)).values()) < sum(designs.left(2).values())
 
 
-def test_a_common_factor_is_not_told_by_frames_and_an_offset_is(monkeypatch):
-    # Of the formula without its loose part only pressure over stiffness matters, as of a valve.
+def test_frames_determine_an_offset_of_the_pressures_but_no_factor(monkeypatch):
+    # Without its loose part the formula depends on pressure over stiffness only.
     rigid = {**FIELDS, "loose": np.zeros_like(FIELDS["loose"])}
     monkeypatch.setattr("tests.made_up_closure.FIELDS", rigid)
     use(monkeypatch)
@@ -80,44 +78,24 @@ def test_a_common_factor_is_not_told_by_frames_and_an_offset_is(monkeypatch):
         found.left(5, errors_of(kind, 20.0, PRESSURE))["E_f.anterior"]
         for kind in ("factor", "offset")
     )
-    # Common are two moduli, chordae and pressure, each with its prior: 1 / sum of 1 / variance.
+    # Two moduli, chordae and pressure have a common factor: 1 / sum of 1 / variance.
     prior = [found.knowledge[name] for name in ("E_f.anterior", "E_f.posterior", "chord_stiffness")]
     common = 1.0 / np.sqrt(sum(1.0 / std**2 for std in (*prior, 0.2)))
     assert factor == pytest.approx(common / prior[0], rel=0.02)
     assert offset < 0.2 * factor
 
 
-def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
-    use(monkeypatch)
-    moved = np.zeros((6, *CASE.surface.vertices.shape, 2))
-    moved[1:, ..., 0] = 1.0
-    two = GeometryModes("one", {"fibres": np.eye(2)})
-    monkeypatch.setattr("mvest.personalisation.errors.geometry_modes", lambda *_: (two,))
-    monkeypatch.setattr(
-        "mvest.personalisation.sources.RestVariation.joined", lambda modes: modes[0]
-    )
-
-    class Rest:
-        def __init__(self, model, seen):
-            pass
-
-        def variation(self, parts):
-            return parts
-
-        def change(self, m, variation, states, tolerance):
-            assert len(states) == 4
-            return moved.copy()
-
-    monkeypatch.setattr("mvest.personalisation.sources.RestGeometry", Rest)
-    exact = design_case(CASE, settings(pressures=STATED))
-    doubted = design_case(CASE, settings(pressures=STATED, nuisance_geometry=NuisanceGeometry()))
-    assert [n for n in doubted.knowledge if n.startswith("geometry")] == ["geometry.0"]
+def test_errors_of_the_geometry_are_common_to_all_frames(designs, monkeypatch):
+    up = np.tile(np.ones_like(FIELDS["loose"]).reshape(-1, 1), (5, 1))
+    source = error_source(up, GeometryModes("one", {"fibres": np.eye(1)}))
+    monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", lambda *_: (source,))
+    wider = design_case(CASE, settings(pressures=STATED, nuisance_geometry=NuisanceGeometry()))
+    assert [n for n in wider.names if n.startswith("geometry")] == ["geometry.0"]
     for count in (1, 5):
-        own, other = exact.left(count), doubted.left(count)
+        own, other = designs.left(count), wider.left(count)
         assert all(other[name] >= own[name] for name in own)
-    # What moves all frames alike is known from all of them.
-    assert doubted.at(5).names[-1] == doubted.at(1).names[-1] == "geometry.0"
-    assert doubted.at(5).std[-1] < doubted.at(1).std[-1]
+    # All frames determine a common displacement.
+    assert wider.std(5)["geometry.0"] < wider.std(1)["geometry.0"]
 
 
 def test_a_valve_that_does_not_close_has_no_designs(monkeypatch):
@@ -125,7 +103,7 @@ def test_a_valve_that_does_not_close_has_no_designs(monkeypatch):
     assert "no equilibrium" in design_case(CASE, settings(pressures=STATED))
 
 
-def test_without_an_unknown_pressure_nothing_is_said_of_its_errors(monkeypatch):
+def test_without_an_unknown_pressure_its_errors_do_not_count(monkeypatch):
     use(monkeypatch)
     moduli = tuple(u for u in unknowns() if u.name.startswith("E_f."))
     found = design_case(CASE, settings(*moduli))

@@ -1,16 +1,19 @@
-"""What an estimate knows, what its intervals rest on and what would narrow them, by hand."""
+"""Derived quantities, sources of variance and advice, against dense linear algebra."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mvest.cases.case import Role
-from mvest.estimation.transform import to_filter
+from mvest.cases.case import ErrorSamples, Role
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.transform import Identity, to_filter
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation import personalise
 from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
-from mvest.personalisation.known import EXACTLY, PRESSURE_MMHG, SINGLE
+from mvest.personalisation.known import EXACTLY, PRESSURE_MMHG, REACH, SINGLE, data_alone
+from mvest.personalisation.sources import FrameSamples
 from mvest.valve.measure.strain import mean_strains
 from tests.made_up_closure import (
     FIELDS,
@@ -27,85 +30,82 @@ from tests.made_up_closure import (
 STD = 0.3
 THICKNESS = GeometryModes("thickness", {"thickness": np.ones((1, 1))})
 COLUMN = 0.3 * FIELDS["E_f.anterior"].reshape(-1, 1)
-"""What one standard deviation of the thickness does to the closed frame, mm."""
+"""Effect of one standard deviation of the thickness on the closed frame, mm."""
 
 
-def fitted(monkeypatch, *given, noise=2, errors=None):
-    """A case in which a thickness is not known."""
+def fitted(monkeypatch, *given, errors=None):
+    """A case with an uncertain thickness."""
     use(monkeypatch)
     source = error_source(COLUMN, THICKNESS)
     monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", lambda *_: (source,))
     return personalise(
-        made_up_case(STD, noise=np.random.default_rng(noise)),
+        made_up_case(STD, noise=np.random.default_rng(2)),
         settings(*given, nuisance_geometry=NuisanceGeometry(), errors=errors),
     )
 
 
 def dense(fit):
-    """Prior ``(p, p)`` of the unknowns, and their slopes ``(k, p)``."""
+    """Prior covariance ``(p, p)`` of the unknowns, and their slopes ``(k, p)``."""
     filtered = fit.result.filtered
     z = filtered.transformed.mean
     H = filtered.prediction.jacobian * filtered.transform.derivative(z)
     return to_filter(filtered.transform, fit.result.filtered.prior).covariance, H
 
 
-def rows_of(fit):
-    """What is measured -> standard deviation of each modulus then."""
-    rows = fit.known.narrower
-    return {
-        row.what: np.array([r.std_if_known for r in rows if r.what == row.what]) for row in rows
-    }
-
-
-def test_what_would_narrow_is_the_update_by_hand(monkeypatch):
-    fit = fitted(monkeypatch)
+def posterior(fit, std=STD, sizes=None, thickness=1.0):
+    """Covariance ``(p + 1, p + 1)`` of unknowns and thickness, by dense linear algebra."""
     P, H = dense(fit)
+    share = np.array([(sizes or {}).get(name, 1.0) for name in fit.result.parameters])
+    joint = np.concatenate([H, thickness * COLUMN], axis=1) / std
+    prior = np.zeros((len(P) + 1,) * 2)
+    prior[:-1, :-1], prior[-1, -1] = np.linalg.inv(P * np.outer(share, share)), 1.0
+    return np.linalg.inv(prior + joint.T @ joint)
 
-    def by_hand(better=None, thickness=1.0, beats=1.0):
-        share = np.array([(better or {}).get(name, 1.0) for name in fit.result.parameters])
-        joint = np.concatenate([H, thickness * COLUMN], axis=1) * np.sqrt(beats) / STD
-        prior = np.zeros((len(P) + 1,) * 2)
-        prior[:-1, :-1], prior[-1, -1] = np.linalg.inv(P * np.outer(share, share)), 1.0
-        return np.sqrt(np.diag(np.linalg.inv(prior + joint.T @ joint)))[:2]
 
-    now = [row.std_now for row in fit.known.narrower[:2]]
+def stds_of(fit):
+    """Standard deviations of the moduli now, and by what is measured."""
+    found = {}
+    for row in fit.details["narrower"]:
+        what = row["what"].partition(", ")[2]
+        found.setdefault(what, []).append(row["std_if_known"])
+    now = [row["std_now"] for row in fit.details["narrower"][:2]]
+    return np.array(now), {what: np.array(stds) for what, stds in found.items()}
+
+
+def test_advice_is_the_update_by_hand(monkeypatch):
+    fit = fitted(monkeypatch)
+
+    def by_hand(*given, **more):
+        return np.sqrt(np.diag(posterior(fit, *given, **more)))[:2]
+
+    now, found = stds_of(fit)
     np.testing.assert_allclose(now, by_hand(), rtol=1e-6)
     np.testing.assert_allclose(now, fit.result.filtered.transformed.std[:2], rtol=1e-6)
-    found = rows_of(fit)
     pressure = {"pressure_scale": PRESSURE_MMHG / (0.1 * PRESSURE)}
     expected = {
-        "pressure measured to ±3 mmHg": by_hand(pressure),
-        "lengths of the chordae measured to ±0.5 %": by_hand({"chord_rest_length": 0.25}),
-        "thickness of the leaflets measured to a third of its error now": by_hand(None, 1 / 3),
-        "mean of 4 beats": by_hand(beats=4.0),
+        "pressure measured to ±3 mmHg": by_hand(sizes=pressure),
+        "lengths of the chordae measured to ±0.5 %": by_hand(sizes={"chord_rest_length": 0.25}),
+        "thickness of the leaflets measured to a third of its error now": by_hand(thickness=1 / 3),
+        "mean of 4 beats": by_hand(STD / 2.0),
     }
     for what, stds in expected.items():
         np.testing.assert_allclose(found[what], stds, rtol=1e-6, err_msg=what)
 
 
 @pytest.mark.parametrize("errors", [None, ErrorBeliefs(resolution_mm=0.1)])
-def test_no_advice_promises_more_than_exact_knowledge_of_all_that_can_be_measured(
-    monkeypatch, errors
-):
+def test_no_advice_promises_more_than_knowing_everything_measurable(monkeypatch, errors):
     fit = fitted(monkeypatch, errors=errors)
-    found, now = rows_of(fit), np.array([row.std_now for row in fit.known.narrower[:2]])
+    now, found = stds_of(fit)
+    # Stated errors have no floor, so nothing is promised of infinitely many beats.
+    assert ("mean of any number of beats" in found) == (errors is not None)
+    if errors is not None:
+        floor = np.sqrt(np.diag(posterior(fit, 0.1)))[:2]
+        np.testing.assert_allclose(found["mean of any number of beats"], floor, rtol=1e-6)
     least = found.pop(EXACTLY)
     assert np.all(least > 0.0)
     for what, stds in found.items():
         assert np.all(stds >= least * (1 - 1e-9)), what
         assert np.all(stds <= now * (1 + 1e-9)), what
-
-
-def test_any_number_of_beats_leaves_the_floor_and_all_that_they_have_in_common(monkeypatch):
-    fit = fitted(monkeypatch, errors=ErrorBeliefs(resolution_mm=0.1))
-    P, H = dense(fit)
-    joint = np.concatenate([H, COLUMN], axis=1) / 0.1
-    prior = np.zeros((len(P) + 1,) * 2)
-    prior[:-1, :-1], prior[-1, -1] = np.linalg.inv(P), 1.0
-    floor = np.sqrt(np.diag(np.linalg.inv(prior + joint.T @ joint)))[:2]
-    np.testing.assert_allclose(rows_of(fit)["mean of any number of beats"], floor, rtol=1e-6)
-    # Errors that are stated have no floor: nothing is promised of their end.
-    assert "mean of any number of beats" not in rows_of(fitted(monkeypatch))
 
 
 def test_shares_are_parts_of_the_variance(monkeypatch):
@@ -115,12 +115,12 @@ def test_shares_are_parts_of_the_variance(monkeypatch):
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + N)
     left = np.eye(len(P)) - K @ H
     variance = np.diag(left @ P)
-    shares = {(row.source, row.parameter): row.share for row in fit.known.shares}
+    shares = {(r["source"], r["parameter"]): r["share"] for r in fit.details["shares"]}
     for k, name in enumerate(fit.result.parameters[:2]):
         expected = {
             SINGLE: STD**2 * K[k] @ K[k],
             "thickness": (K[k] @ COLUMN[:, 0]) ** 2,
-            "pressure_scale": left[k, 2] ** 2 * P[2, 2],
+            "pressure (factor)": left[k, 2] ** 2 * P[2, 2],
         }
         for source, part in expected.items():
             assert shares[source, name] == pytest.approx(part / variance[k], rel=1e-6)
@@ -128,56 +128,70 @@ def test_shares_are_parts_of_the_variance(monkeypatch):
 
 
 def test_a_wrong_pressure_moves_the_moduli_and_not_their_ratio(monkeypatch):
-    given = unknowns()
-    wide = [replace(u, std=0.4) if u.name == "pressure_scale" else u for u in given]
+    wide = [replace(u, std=0.4) if u.name == "pressure_scale" else u for u in unknowns()]
     fit = fitted(monkeypatch, *wide)
-    known = {one.name: one for one in fit.known.quantities}
-    ratio = known["ratio of E_f anterior to posterior"]
-    m = fit.result.estimate
-    assert ratio.estimate == pytest.approx(m[0] / m[1])
-    assert ratio.generic == pytest.approx(6.23 / 2.09, rel=1e-2)
-    # Along the ratio the variances of both moduli come with their covariance.
+    known = {row["name"]: row for row in fit.details["known"]}
+    ratio, m = known["ratio of E_f anterior to posterior"], fit.result.estimate
+    assert ratio["estimate"] == pytest.approx(m[0] / m[1])
+    assert ratio["generic"] == pytest.approx(6.23 / 2.09, rel=1e-2)
     C = fit.result.filtered.transformed.covariance
     std = np.sqrt(C[0, 0] + C[1, 1] - 2 * C[0, 1])
-    assert np.log(ratio.high / ratio.low) == pytest.approx(2 * 1.959964 * std)
+    assert np.log(ratio["high"] / ratio["low"]) == pytest.approx(2 * REACH * std)
     per_pressure = known["E_f posterior if the stated pressure is right"]
-    assert per_pressure.estimate == pytest.approx(m[1] / m[2])
-    own = np.log(per_pressure.high / per_pressure.low)
-    assert own < 0.7 * 2 * 1.959964 * fit.result.filtered.transformed.std[1]
+    assert per_pressure["estimate"] == pytest.approx(m[1] / m[2])
+    own = np.log(per_pressure["high"] / per_pressure["low"])
+    assert own < 0.7 * 2 * REACH * fit.result.filtered.transformed.std[1]
 
 
-def test_data_alone_are_the_estimate_without_the_prior_of_that_modulus(monkeypatch):
-    fit = fitted(monkeypatch)
-    given = unknowns()
-    for k, alone in enumerate(fit.known.data_alone):
-        wide = [replace(u, std=1e3 * u.mean) if j == k else u for j, u in enumerate(given)]
-        other = fitted(monkeypatch, *wide).result
-        # The formula is bent, and the prior's mean another one: to first order.
-        assert np.log(alone.estimate) == pytest.approx(np.log(other.estimate[k]), abs=0.05)
-        assert np.log(alone.high / alone.low) == pytest.approx(
-            2 * 1.959964 * other.filtered.transformed.std[k], rel=0.1
-        )
+def test_data_alone_are_what_the_prior_was_updated_by():
+    prior, data = Gaussian.from_variance([1.0], 2.0**2), Gaussian.from_variance([3.0], 1.5**2)
+    precision = 1 / 2.0**2 + 1 / 1.5**2
+    after = Gaussian.from_variance([(1.0 / 2.0**2 + 3.0 / 1.5**2) / precision], 1 / precision)
+    filtered = SimpleNamespace(
+        names=("E_f.a",), transform=Identity(), prior=prior, transformed=after
+    )
+    (row,) = data_alone(filtered)
+    ends = data.mean + REACH * data.std * np.array([0.0, -1.0, 1.0])
+    assert np.log([row["estimate"], row["low"], row["high"]]) == pytest.approx(ends)
+    assert row["prior_stds"] == pytest.approx((3.0 - 1.0) / 2.0)
 
 
 def test_strains_are_those_of_the_fitted_valve_with_the_spread_of_its_posterior(monkeypatch):
     fit = fitted(monkeypatch)
-    case, rng = fit.case, np.random.default_rng(5)
-    surface = case.surface
-    strains = [one for one in fit.known.quantities if one.name.startswith("strain")]
-    P, H = dense(fit)
-    joint = np.concatenate([H, COLUMN], axis=1) / STD
-    prior = np.zeros((len(P) + 1,) * 2)
-    prior[:-1, :-1], prior[-1, -1] = np.linalg.inv(P), 1.0
-    posterior = np.linalg.inv(prior + joint.T @ joint)
-    drawn = rng.multivariate_normal(np.zeros(len(posterior)), posterior, 400)
-    closed = case.frame(Role.CLOSED).vertices.shape
-    at = fit.fitted["closed"]
+    surface, rng = fit.case.surface, np.random.default_rng(5)
+    strains = [row for row in fit.details["known"] if row["name"].startswith("strain")]
+    joint = np.concatenate([dense(fit)[1], COLUMN], axis=1)
+    drawn = rng.multivariate_normal(np.zeros(joint.shape[1]), posterior(fit), 400)
+    closed = fit.case.frame(Role.CLOSED).vertices.shape
+    at = fit.frames[0].positions["personalised"]
     values = np.array(
-        [mean_strains(surface.vertices, at + (joint @ d * STD).reshape(closed), surface).ravel()
+        [mean_strains(surface.vertices, at + (joint @ d).reshape(closed), surface).ravel()
          for d in drawn]
     )  # fmt: skip
-    stds = [(one.high - one.low) / (2 * 1.959964) for one in strains]
+    stds = np.array([(row["high"] - row["low"]) / (2 * REACH) for row in strains])
     np.testing.assert_allclose(stds, 100 * values.std(axis=0), rtol=0.15)
-    true = mean_strains(surface.vertices, shape(TRUE), surface).ravel()
-    for one, truth in zip(strains, 100 * true, strict=True):
-        assert abs(one.estimate - truth) < 3 * (one.high - one.low) / (2 * 1.959964)
+    true = 100 * mean_strains(surface.vertices, shape(TRUE), surface).ravel()
+    assert np.all(np.abs([row["estimate"] for row in strains] - true) < 3 * stds)
+
+
+def test_an_error_that_the_moduli_undo_hardly_changes_the_strain(monkeypatch):
+    # Samples move the prediction as the anterior modulus does. The estimate follows the frame.
+    use(monkeypatch)
+    case = made_up_case(0.05, noise=np.random.default_rng(2), displaced=False)
+    # They are small against the prior, so nearly all of them is undone.
+    moved = 0.05 * np.random.default_rng(4).standard_normal((12, 1, 1)) * FIELDS["E_f.anterior"]
+    monkeypatch.setattr(
+        "mvest.personalisation.errors.sample_frames",
+        lambda *_: FrameSamples(moved, 0.0 * moved, 0.0 * moved),
+    )
+    n, f = len(case.surface.vertices), len(case.frames)
+    samples = ErrorSamples(np.zeros((12, f, n, 3)), np.zeros((12, f, 2, 3)))
+    wanted = settings(*unknowns(fixed=True))
+    plain, wider = (personalise(c, wanted) for c in (case, replace(case, error_samples=samples)))
+    assert wider.result.std[0] > 3.0 * plain.result.std[0]
+    widths = [
+        [row["high"] - row["low"] for row in fit.details["known"] if row["unit"] == "%"][:2]
+        for fit in (plain, wider)
+    ]
+    # Without the compensation it would be sixteen times.
+    assert np.all(np.array(widths[1]) < 8.0 * np.array(widths[0]))

@@ -1,4 +1,4 @@
-"""The study's joint on an analytic model, whose answers are known by hand."""
+"""Estimates of an analytic model, whose answers are known by hand."""
 
 import dataclasses
 
@@ -14,7 +14,6 @@ from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteN
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import Problem, StudyResult, estimate
 from mvest.problem.record import record_of
-from mvest.problem.registration import unit_of
 from mvest.problem.synthetic import Truth, TwinData, simulate_observation
 
 NAMES = ("E_f.anterior", "E_f.posterior")
@@ -24,9 +23,9 @@ TRUTH = np.array([6.23, 2.09])
 
 
 class Sheet:
-    """Points that move by A / m: stiffer means less, as in a leaflet."""
+    """Points that move by A / m: stiffer means less motion, as in a leaflet."""
 
-    def __init__(self, factor: float = 20.0) -> None:
+    def __init__(self, factor: float = 20.0):
         rng = np.random.default_rng(7)
         self.open = rng.normal(size=3 * VERTICES)
         self.A = factor * rng.normal(size=(3 * VERTICES, 2))
@@ -62,7 +61,7 @@ def case(model=None, filter_=None) -> Problem:
     return Problem(NAMES, model or Sheet(), prior, filter_ or IteratedFilter(), Identity(), TISSUE)
 
 
-def test_paper_filter_finds_the_truth_of_a_twin() -> None:
+def test_paper_filter_finds_the_truth_of_a_twin():
     data = observe()
     result = estimate(case(filter_=PaperFilter(0.01)), data.observation).against(data.truth)
     assert result.converged
@@ -71,12 +70,12 @@ def test_paper_filter_finds_the_truth_of_a_twin() -> None:
     assert result.distance.max() < 1e-6
 
 
-def test_all_six_moduli_follow_through_the_fixed_ratios() -> None:
-    # E_perp = E_f / r and G = E_f / (2 (1 + 0.488)): the errors of one leaflet are all alike.
+def test_derived_moduli_follow_by_fixed_ratios():
+    # E_perp = E_f / r and G = E_f / (2 (1 + 0.488)), with the same relative error.
     data = observe(noise_mm=0.05)
     result = estimate(case(), data.observation).against(data.truth)
-    unknowns = record_of(result).unknowns
-    assert {one.name: round(one.truth or 0, 2) for one in unknowns} == {
+    own = {one.name: one for one in record_of(result).unknowns}
+    assert {name: round(one.truth, 2) for name, one in own.items()} == {
         "E_f.anterior": 6.23,
         "E_perp.anterior": 2.35,
         "G.anterior": 2.09,
@@ -84,17 +83,15 @@ def test_all_six_moduli_follow_through_the_fixed_ratios() -> None:
         "E_perp.posterior": 1.89,
         "G.posterior": 0.70,
     }
-    own = {one.name: one for one in unknowns}
-    errors = result.estimate / TRUTH - 1.0
-    for region, error in zip(("anterior", "posterior"), errors, strict=True):
-        assert abs(error) > 1e-5
+    for region, error in zip(TISSUE, result.estimate / TRUTH - 1.0, strict=True):
         for name in ("E_f", "E_perp", "G"):
             assert own[f"{name}.{region}"].relative_error == pytest.approx(error, rel=1e-9)
-    fibre, across = own["E_f.anterior"], own["E_perp.anterior"]
-    assert across.std == pytest.approx(fibre.std * 2.35 / 6.23)
+    for key in ("std", "low", "high"):
+        fibre, across = (getattr(own[f"{name}.anterior"], key) for name in ("E_f", "E_perp"))
+        assert across == pytest.approx(fibre * 2.35 / 6.23)
 
 
-def test_the_estimator_is_given_nothing_that_knows_the_truth() -> None:
+def test_the_estimator_never_receives_the_truth():
     fields = {f.name for cls in (Problem, Observation) for f in dataclasses.fields(cls)}
     assert not any("truth" in name or "true" in name for name in fields)
     data = observe()
@@ -105,16 +102,7 @@ def test_the_estimator_is_given_nothing_that_knows_the_truth() -> None:
     assert all(one.truth is None for one in record_of(result).unknowns)
 
 
-def test_noise_has_the_stated_size_and_follows_the_seed() -> None:
-    data, again, other = observe(noise_mm=0.5), observe(noise_mm=0.5), observe(noise_mm=0.5, seed=2)
-    noise = data.observation.positions - data.truth.positions
-    # 240 numbers: the standard error of their SD is 0.5 / sqrt(480) = 0.023.
-    assert noise.std() == pytest.approx(0.5, abs=3 * 0.023)
-    np.testing.assert_array_equal(data.observation.positions, again.observation.positions)
-    assert np.abs(data.observation.positions - other.observation.positions).max() > 0.1
-
-
-def test_the_distance_to_the_truth_leaves_the_noise_out() -> None:
+def test_the_distance_to_the_truth_leaves_the_noise_out():
     data = observe(noise_mm=0.5)
     result = estimate(case(), data.observation).against(data.truth)
     # The norm of three N(0, 0.5²) numbers has the mean 0.5 · sqrt(8/π) = 0.80.
@@ -123,25 +111,7 @@ def test_the_distance_to_the_truth_leaves_the_noise_out() -> None:
     assert result.distance_to_truth.mean() < 0.2
 
 
-def test_only_the_closed_frame_gives_the_same_estimate_as_both() -> None:
-    # The open frame does not depend on the moduli.
-    estimates = []
-    for frames in (("open", "closed"), ("closed",)):
-        data = observe(frames=frames, noise_mm=0.0)
-        assert data.observation.positions.shape == (len(frames), VERTICES, 3)
-        estimates.append(estimate(case(), data.observation).estimate)
-    np.testing.assert_allclose(estimates[0], estimates[1], rtol=1e-9)
-
-
-def test_each_frame_may_have_its_own_variance() -> None:
-    data = observe(variance=[0.01, 0.04])
-    R = data.observation.R
-    assert R.shape == (2 * 3 * VERTICES,)
-    np.testing.assert_array_equal(np.unique(R[: 3 * VERTICES]), [0.01])
-    np.testing.assert_array_equal(np.unique(R[3 * VERTICES :]), [0.04])
-
-
-def test_the_bound_scales_with_the_noise() -> None:
+def test_the_bound_scales_with_the_noise():
     stds = []
     for variance in (0.01, 0.04):
         data = observe(variance=variance)
@@ -151,34 +121,14 @@ def test_the_bound_scales_with_the_noise() -> None:
     np.testing.assert_allclose(stds[1] / stds[0], 2.0, rtol=1e-2)
 
 
-def test_a_failing_truth_is_a_value_with_its_reason() -> None:
+def test_a_failing_truth_is_a_value_with_its_reason():
     data = observe(failing)
     assert data.observation is None
     assert data.truth is None
     assert "Newton" in data.reason
     result = StudyResult.failed(case(), data.reason)
     assert not result.converged
-    assert result.estimate is None
-    assert result.std is None
-    assert result.distance is None
-
-
-def test_a_failing_model_is_a_value_with_its_reason() -> None:
-    data = observe()
-    result = estimate(case(failing), data.observation).against(data.truth)
-    assert not result.converged
-    assert result.estimate is None
-    assert "Newton" in result.detail
-
-
-def test_a_step_to_impossible_moduli_is_shortened_and_not_raised() -> None:
-    # From a start of 40 MPa the first step of Gauss-Newton on 1/m goes far below zero.
-    data = observe()
-    prior = Gaussian.from_variance(np.array([40.0, 40.0]), 1e4)
-    far = Problem(NAMES, Sheet(), prior, IteratedFilter(), Identity(), TISSUE)
-    result = estimate(far, data.observation)
-    assert result.converged
-    np.testing.assert_allclose(result.estimate, TRUTH, rtol=1e-3)
+    assert result.estimate is result.std is result.distance is None
 
 
 @pytest.mark.parametrize(
@@ -186,44 +136,29 @@ def test_a_step_to_impossible_moduli_is_shortened_and_not_raised() -> None:
     [
         ({"noise_mm": -1.0}, "noise std = -1.0"),
         ({"frames": ("shut",)}, "shut"),
-        ({"frames": ()}, "expected some of"),
-        ({"frames": ("closed", "closed")}, "expected some of"),
         ({"variance": 0.0}, "R is 0"),
-        ({"variance": [0.1, 0.1, 0.1]}, "R has shape"),
-        ({"variance": np.nan}, "R must be finite"),
     ],
 )
-def test_bad_input_is_refused(change: dict, words: str) -> None:
+def test_bad_input_is_refused(change: dict, words: str):
     with pytest.raises(InputError, match=words):
         observe(**change)
 
 
-def test_bad_values_and_shapes_are_refused() -> None:
+def test_bad_values_and_shapes_are_refused():
     rng = np.random.default_rng(1)
     with pytest.raises(InputError, match="1 true values for the 2 parameters"):
         simulate_observation(Sheet(), NAMES, np.array([1.0]), variance=1.0, rng=rng)
     with pytest.raises(MaterialError, match="expected > 0"):
         simulate_observation(Sheet(), NAMES, np.array([-1.0, 1.0]), variance=1.0, rng=rng)
-    with pytest.raises(InputError, match="shape"):
-        Observation(("closed",), np.zeros((2, 5, 3)), np.array([1.0]))
-    with pytest.raises(InputError, match="finite"):
-        Observation(("closed",), np.full((1, 5, 3), np.nan), np.array([1.0]))
     with pytest.raises(InputError, match="prior has 1"):
-        Problem(
-            NAMES,
-            Sheet(),
-            Gaussian.from_variance(np.ones(1), 1.0),
-            IteratedFilter(),
-            Identity(),
-            {},
-        )
+        dataclasses.replace(case(), prior=Gaussian.from_variance(np.ones(1), 1.0))
     data = observe()
     with pytest.raises(InputError, match="truth is of"):
         estimate(case(), data.observation).against(Truth(("a", "b"), TRUTH, np.zeros((2, 1, 3))))
 
 
-def test_an_unseen_vertex_has_no_say() -> None:
-    # Its position is nowhere to be read, and the estimate is that of the remaining rows.
+def test_an_unobserved_vertex_does_not_count():
+    # The estimate is that of the remaining rows.
     data = observe(noise_mm=0.2)
     positions = data.observation.positions.copy()
     hidden = np.arange(VERTICES) % 4 > 0
@@ -241,45 +176,33 @@ def test_an_unseen_vertex_has_no_say() -> None:
     by_hand = IteratedFilter()(part, case().prior, positions.ravel()[rows], 0.01)
     np.testing.assert_allclose(result.estimate, by_hand.mean, rtol=1e-12)
     assert np.abs(result.estimate - estimate(case(), data.observation).estimate).max() > 1e-3
-    # What was not seen is fitted all the same, and has no distance to an observation.
+    # Unobserved vertices are fitted, but have no distance to the observation.
     assert result.fitted.shape == (2, VERTICES, 3)
     np.testing.assert_array_equal(np.isnan(result.distance), hidden)
     assert np.isfinite(result.distance_to_truth).all()
 
 
-def test_an_observation_of_nothing_is_refused() -> None:
-    with pytest.raises(InputError, match="no vertex is seen"):
-        Observation(("closed",), np.full((1, 5, 3), np.nan), np.array([1.0]))
-    half = np.zeros((1, 5, 3))
-    half[0, 2, 1] = np.nan
-    with pytest.raises(InputError, match="must be finite"):
-        Observation(("closed",), half, np.array([1.0]))
-    correlation = SpatialCorrelation(np.eye(3), 5.0)
-    with pytest.raises(InputError, match="between 3 vertices, but 5"):
-        Observation(("closed",), np.zeros((1, 5, 3)), np.array([1.0]), correlation)
-
-
-def test_the_filter_may_be_told_that_errors_are_correlated() -> None:
-    # With correlated errors the white R claims too much; the correlated R is told the truth.
+def test_a_filter_with_the_true_correlation_has_right_intervals():
+    # The white R claims too much of correlated errors.
     points = np.random.default_rng(3).uniform(0.0, 10.0, (VERTICES, 3))
     correlation = SpatialCorrelation(points, 5.0)
     errors = [CorrelatedNoise(0.5, correlation)]
-    z = {}
-    for told in (None, correlation):
+    z = []
+    for stated in (correlation, None):
         found = []
         for seed in range(60):
             sheet = smooth_sheet(points)
-            data = observe(sheet, seed=seed, errors=errors, correlation=told, variance=0.25)
+            data = observe(sheet, seed=seed, errors=errors, correlation=stated, variance=0.25)
             result = estimate(case(sheet), data.observation).against(data.truth)
             found.append((result.estimate - TRUTH) / result.std)
-        z[told is None] = np.std(found)
+        z.append(np.std(found))
     # Standard error of an SD of 120 numbers: 1 / sqrt(240) = 0.065.
-    assert z[False] == pytest.approx(1.0, abs=4 * 0.065)
-    assert z[True] > 1.5
+    assert z[0] == pytest.approx(1.0, abs=4 * 0.065)
+    assert z[1] > 1.5
 
 
 def smooth_sheet(points: np.ndarray) -> Sheet:
-    """A sheet whose neighbours move alike, as correlated errors do."""
+    """A sheet whose neighbours move together, as correlated errors do."""
     sheet = Sheet()
     field = np.stack([points[:, 0] + 1.0, np.cos(points[:, 1] / 4.0) + 2.0], axis=-1)
     sheet.A = np.repeat(field, 3, axis=0) * 20.0
@@ -287,14 +210,14 @@ def smooth_sheet(points: np.ndarray) -> Sheet:
 
 
 class Wandering:
-    """A model whose predictions remember, beyond what is harmless, where it was before."""
+    """A model whose predictions depend too much on the last state."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.sheet = Sheet()
         self.closed: ClosedState | None = None
         self.solves = 0
 
-    def restart(self, closed: ClosedState | None) -> None:
+    def restart(self, closed: ClosedState | None):
         self.closed = closed
 
     def __call__(self, m: np.ndarray) -> Prediction:
@@ -305,7 +228,7 @@ class Wandering:
         return Prediction(found.y + memory, found.jacobian)
 
 
-def test_estimates_from_a_shared_start_do_not_depend_on_each_other() -> None:
+def test_estimates_from_a_shared_start_do_not_depend_on_each_other():
     observations = [observe(noise_mm=0.3, seed=seed).observation for seed in range(4)]
     start = case().prior.mean
 
@@ -321,40 +244,25 @@ def test_estimates_from_a_shared_start_do_not_depend_on_each_other() -> None:
     assert estimates([2]) + estimates([3, 1]) + estimates([0]) == [
         together[k] for k in (2, 3, 1, 0)
     ]
-    # The model is one for which this is not a matter of course.
+    # Without the shared start they do depend on each other.
     assert estimates([0, 1, 2], shared=False)[2] != estimates([2], shared=False)[0]
 
 
-def test_a_result_prints_what_a_person_wants_to_know() -> None:
+def test_a_result_prints_estimate_distance_and_truth():
     data = observe(noise_mm=0.05)
-    result = dataclasses.replace(
-        estimate(case(), data.observation).against(data.truth), seconds=1.25
-    )
-    std = result.filtered.std
-    rows = str(result).splitlines()
-    assert rows[0] == f"E_f.anterior   {result.filtered.mean[0]:.4g} ± {std[0]:.2g} MPa"
-    assert rows[1].startswith("E_f.posterior  2.")
-    assert rows[2].startswith("converged: the change of every parameter is below the tolerance")
-    assert f"{result.filtered.iterations} iterations" in rows[2]
+    result = estimate(case(), data.observation).against(data.truth)
+    rows = str(dataclasses.replace(result, seconds=1.25)).splitlines()
+    mean, std = result.filtered.mean[0], result.filtered.std[0]
+    assert rows[0] == f"E_f.anterior   {mean:.4g} ± {std:.2g} MPa"
     assert rows[2].endswith(f"{result.filtered.forward_solves} forward solves, 1.2 s")
     assert rows[3] == f"fitted to observed: {np.mean(result.distance):.2f} mm on average"
     assert rows[4:] == ["truth: E_f.anterior 6.23, E_f.posterior 2.09"]
-    # An estimate by itself knows no units.
-    assert str(result.filtered).splitlines()[0] == rows[0].removesuffix(" MPa")
 
 
-def test_a_result_without_an_estimate_prints_why() -> None:
+def test_a_result_without_an_estimate_prints_why():
     assert str(StudyResult.failed(case(), "no frame")) == "no estimate: no frame"
-    data = observe()
-    failed = estimate(case(failing), data.observation)
+    failed = estimate(case(failing), observe().observation)
+    assert not failed.converged
+    assert failed.estimate is None
     assert str(failed).startswith("no estimate: not converged: the model gives no prediction")
     assert "Newton's method did not converge" in str(failed)
-
-
-@pytest.mark.parametrize(
-    ("name", "unit"),
-    [("E_f.anterior", "MPa"), ("pressure_scale", ""), ("shift.x", "mm"), ("turn.z", "degrees"),
-     ("m[0]", "")],
-)  # fmt: skip
-def test_units_of_parameters(name: str, unit: str) -> None:
-    assert unit_of(name) == unit

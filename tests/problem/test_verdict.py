@@ -1,4 +1,4 @@
-"""What each check of an estimate lets through and what it stops."""
+"""What each check of an estimate admits and what it refuses."""
 
 import math
 
@@ -56,7 +56,7 @@ GOOD = ALWAYS | {
 }
 
 
-def test_an_estimate_against_which_nothing_speaks_is_trustworthy():
+def test_an_estimate_that_passes_all_checks_is_trustworthy():
     verdict = judge(GOOD)
     assert verdict.trust == TRUSTWORTHY
     assert verdict.failed_checks == ()
@@ -67,32 +67,26 @@ def test_an_estimate_against_which_nothing_speaks_is_trustworthy():
 
 CASES = [
     ("failed", texts("it did not close"), NONE, "it did not close"),
-    ("unfinished", texts("20 iterations"), NONE, "20 iterations"),
     ("approximation", texts("bent"), DOUBTFUL, "not that of the posterior: bent"),
-    ("moved", one(0.55), DOUBTFUL, "is 0.55 of its standard deviations from"),
     ("law", one(0.24), DOUBTFUL, "0.24 of the way from the linear law"),
     ("law", one(0.36), NONE, "0.36 of the way from the linear law"),
     ("unaccounted", texts("no law"), DOUBTFUL, "not in the intervals: no law"),
     ("mistakes", texts("units: is it in cm?"), NONE, "is it in cm?"),
     ("unlike", texts("seen with 0.7"), NONE, "seen with 0.7"),
     ("implausible", texts("thickness: 4 mm"), DOUBTFUL, "thickness: 4 mm"),
-    ("implausible", texts("thick", "wide")[1:], DOUBTFUL, "wide"),
-    ("innovation", innovation(1.02), DOUBTFUL, "1.03 times"),
-    ("innovation", innovation(1.51), NONE, "times what its errors"),
-    ("alike", one(0.28, alike=-0.28), DOUBTFUL, "correlation -0.28"),
-    ("stretch", sizes(pressure_scale=2.53), DOUBTFUL, "pressure_scale"),
+    ("innovation", innovation(1.02), DOUBTFUL, "1.03 times as large"),
+    ("alike", one(0.28, alike=-0.28), DOUBTFUL, "correlated (-0.28"),
     ("stretch", sizes(chord_rest_length=3.7), NONE, "3.7 of its standard"),
     ("data_alone", sizes(anterior=2.2), DOUBTFUL, "anterior 2.2"),
     ("held_out", held(0.01), DOUBTFUL, "frame late"),
-    ("closure", leak(12.1), DOUBTFUL, "leaves 12 mm"),
     ("closure", leak(121.0), NONE, "leaves 121 mm² free, the observed one 2 mm²"),
-    ("again", one(1.0), DOUBTFUL, "ends in another closed state"),
+    ("again", one(1.0), DOUBTFUL, "reaches another closed state"),
     ("gate", one(1.0), DOUBTFUL, "did not pass the gate"),
 ]
 
 
 @pytest.mark.parametrize(("key", "found", "trust", "words"), CASES)
-def test_each_ground_counts_and_says_its_number(key, found, trust, words):
+def test_each_check_counts_and_states_its_number(key, found, trust, words):
     verdict = judge(GOOD | {key: found})
     assert verdict.trust == trust
     (failed,) = verdict.failed_checks
@@ -109,14 +103,14 @@ def test_limits_themselves_are_admitted(key):
     assert judge(GOOD | {key: [(math.nextafter(limit, 99.0), words)]}).trust == DOUBTFUL
 
 
-def test_the_worst_ground_decides_and_stands_first():
+def test_the_gravest_check_decides_and_comes_first():
     verdict = judge(GOOD | {"alike": one(0.5, alike=0.5), "gate": one(1.0), "closure": leak(121)})
     assert verdict.trust == NONE
     assert [failed.trust for failed in verdict.failed_checks] == [NONE, DOUBTFUL, DOUBTFUL]
     assert str(verdict).startswith("none: the fitted valve leaves 121 mm²")
 
 
-def test_what_there_was_nothing_to_look_at_for_is_named_and_not_counted_as_passed():
+def test_checks_without_data_are_missing_and_do_not_count_as_passed():
     verdict = judge(ALWAYS)
     assert len(verdict.missing) == 11
     # Two of these are needed, and two failed_checks are one too many.
@@ -131,7 +125,7 @@ def test_what_there_was_nothing_to_look_at_for_is_named_and_not_counted_as_passe
     assert judge(known).missing[-1] == ONE_STATE
 
 
-def test_two_doubtful_checks_are_none_and_two_grounds_of_one_are_doubtful():
+def test_two_doubtful_checks_are_none_and_two_findings_of_one_are_doubtful():
     smooth = {"alike": one(0.5, alike=0.5)}
     assert judge(GOOD | smooth).trust == DOUBTFUL
     assert judge(GOOD | smooth | {"moved": one(1.0)}).trust == NONE

@@ -1,9 +1,9 @@
-"""What the levels of the verdict are worth, on published estimates of simulated valves.
+"""Skill of the verdict's levels on published estimates of simulated valves.
 
-`results/calibration_estimates.csv` holds 598 estimated moduli of valves for which the model is
-wrong in one of fifteen ways, with what spoke against each. They were judged by other rules; here
-the rules of `mvest.problem.verdict` judge them anew. Which checks count, and how many are too many,
-was set on even seeds; the odd ones had been looked at too.
+`results/calibration_estimates.csv` holds 598 estimated moduli of valves with fifteen kinds of
+misspecification, and the failed checks of each. Those checks had other rules; here the rules of
+`mvest.problem.verdict` judge them anew. They were set on even seeds; the odd ones had been looked
+at too.
 """
 
 import re
@@ -20,7 +20,7 @@ from tests.places import ROOT
 FILE = ROOT / "results" / "calibration_estimates.csv"
 LEVELS = (TRUSTWORTHY, DOUBTFUL, NONE)
 OLD = ("distance", "what the data add")
-"""Checks that were counted then and are no more."""
+"""Checks that no longer exist."""
 LEFT_OUT = "is not in the intervals: "
 
 
@@ -34,7 +34,7 @@ class Level:
 
 
 def diagnostics(failed_checks: str) -> dict[str, Found]:
-    """What was seen of an estimate, from what spoke against it."""
+    """Findings from the published failed checks of an estimate."""
     names = "|".join(map(re.escape, (*{check.name for check in CHECKS.values()}, *OLD)))
     found: dict[str, list[str]] = {}
     for part in re.split(rf"; (?=(?:{names}): )", failed_checks) if failed_checks else []:

@@ -16,7 +16,7 @@ from mvest.scenarios.measures import (
     peak_stress,
     principal_cauchy,
 )
-from tests.mechanics.bodies import block, rotation
+from tests.mechanics.bodies import block
 from tests.mechanics.forces.test_contact import pair
 
 E, NU, STRAIN = 2.0, 0.3, 0.08
@@ -39,31 +39,6 @@ def test_principal_stress_is_that_of_the_push_forward():
     green = 0.5 * (f.T @ f - np.eye(3))
     found = principal_cauchy(six(green, 2.0)[None], six(s)[None])
     np.testing.assert_allclose(found, [np.linalg.eigvalsh(cauchy)[-1]], rtol=1e-12)
-
-
-@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
-def test_a_box_under_a_uniform_load_carries_load_over_current_area(element_type):
-    # Pulled along x: U = diag(1 + e, 1 - nu e, 1 - nu e), so the cross section is
-    # 3 * 2 * (1 - nu e)^2 mm^2 and carries N = E e * 6 mm^2 (Biot stress times area at rest).
-    # Turned, the peak is the same.
-    mesh = block(element_type, (2, 2, 1), SIZE)
-    law = BiotLaw.of((TransverselyIsotropic.isotropic(E, NU),))
-    system = System(Solid(mesh, law))
-    stretch = np.array([1 + STRAIN, 1 - NU * STRAIN, 1 - NU * STRAIN])
-    x = mesh.nodes * stretch @ rotation((1, 2, 3), 0.7).T
-    load = E * STRAIN * SIZE[1] * SIZE[2]
-    area = SIZE[1] * SIZE[2] * (1 - NU * STRAIN) ** 2
-    peak = peak_stress(system, x)
-    assert list(peak) == [P95, P99, LARGEST]
-    for value in peak.values():
-        assert value == pytest.approx(load / area, rel=1e-9)
-    assert nodal_stress(system, x) == pytest.approx(np.full(len(x), load / area), rel=1e-9)
-    # The load is what the box's end carries: the internal forces of its nodes add up to it.
-    state = system.solid.evaluate(x, system.solid.initial_strain(), 0.0)
-    forces = np.zeros_like(x)
-    np.add.at(forces, mesh.elements, system.solid.forces(state))
-    end = mesh.nodes[:, 0] > SIZE[0] - 1e-9
-    assert np.linalg.norm(forces[end].sum(axis=0)) == pytest.approx(load, rel=1e-9)
 
 
 def test_contact_pressure_is_force_over_area():
@@ -98,3 +73,5 @@ def test_a_small_part_under_high_stress_counts_by_its_volume():
     assert peak[P95] == pytest.approx(0.01 * E, rel=1e-6)
     assert peak[P99] == pytest.approx(0.1 * E, rel=1e-6)
     assert peak[LARGEST] == pytest.approx(0.1 * E, rel=1e-6)
+    # Nodes at the far end belong to the small cell alone.
+    assert nodal_stress(system, x).max() == pytest.approx(0.1 * E, rel=1e-6)

@@ -92,6 +92,16 @@ def test_annulus_and_tips_are_off_by_their_size():
     assert np.mean(off[:, 1:] * off[:, :-1]) > 0.8
 
 
+def test_tips_are_off_alike_in_the_open_and_the_closed_frame():
+    case, motion = open_case(tips_mm=2.0), VALVE.motion.papillary_tips
+    off = [
+        case.frame(role).papillary_tips - tips
+        for role, tips in ((Role.REFERENCE, VALVE.papillary_tips), (Role.CLOSED, motion[-1]))
+    ]
+    assert np.abs(off[0]).min() > 0.01
+    np.testing.assert_allclose(off[0], off[1], atol=1e-12)
+
+
 def test_what_is_missing_is_filled_in_without_its_detail():
     gradient = np.array([[0.1, 0.0, 0.2], [0.0, 0.1, 0.0], [0.1, 0.0, 0.0]])
     smooth = POINTS + POINTS @ gradient

@@ -67,13 +67,6 @@ def statuses(folder: Path) -> list[str]:
     return [record.status for record in swept.records]
 
 
-def results(folder: Path) -> dict[str, int]:
-    return {
-        path.parent.name: path.stat().st_mtime_ns
-        for path in (folder / "outputs" / "sweep_debug").glob("*/done")
-    }
-
-
 def running() -> list[str]:
     """Slurm's jobs that run."""
     return asked("squeue", "--noheader", "--states=R", "--format=%A").split()
@@ -100,24 +93,6 @@ def test_the_jobs_of_a_killed_worker_run_again_on_another_one(tmp_path) -> None:
     assert "4 of 4 jobs done" in out
     assert statuses(tmp_path) == ["converged"] * 4
     until(lambda: not asked("squeue", "--noheader"))
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_the_queue_is_empty_after_the_command_was_ended_and_it_goes_on(tmp_path, number) -> None:
-    sweep = start(tmp_path)
-    until(lambda: results(tmp_path))
-    os.kill(sweep.pid, number)
-    end(sweep)
-    assert sweep.returncode == (130 if number == signal.SIGINT else -number)
-    done = results(tmp_path)
-    until(lambda: not asked("squeue", "--noheader"))
-
-    again = start(tmp_path)
-    out = end(again)
-    assert again.returncode == 0, out
-    assert statuses(tmp_path) == ["converged"] * 4
-    after = results(tmp_path)
-    assert {name: after[name] for name in done} == done, "a job that was done ran again"
 
 
 def test_what_slurm_refuses_is_one_line(tmp_path) -> None:

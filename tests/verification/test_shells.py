@@ -5,7 +5,6 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_bvp
 
-from mvest.errors import InputError
 from mvest.mechanics.solver import linear_solver
 from tests.places import ROOT
 from tests.verification.shells import PROBLEMS, row
@@ -40,17 +39,6 @@ def test_thin_shells_follow_the_published_path_if_stiffly(name, element_type, ce
     assert low < ratio.min()
     assert ratio.max() < high
     assert result.solver == linear_solver().name  # nothing had to take its place
-
-
-def test_both_solvers_find_the_same_path():
-    try:
-        linear_solver("pardiso")
-    except InputError:
-        pytest.skip("PARDISO is not installed")
-    one, first = ratios("annulus", "hex18", (15, 3), solver="pardiso")
-    other, second = ratios("annulus", "hex18", (15, 3), solver="superlu")
-    np.testing.assert_allclose(one, other, rtol=1e-6)
-    assert (first.solver, second.solver) == ("pardiso", "superlu")
 
 
 def test_the_cantilever_converges_to_the_elastica():

@@ -37,17 +37,17 @@ UNSTRUCTURED_SURFACE = (112, 29)
 
 @dataclass(frozen=True, kw_only=True)
 class ValveSettings(TemplateParameters):
-    """The template's parameters, or a case whose anatomy is taken instead."""
+    """The template's parameters, or a case whose anatomy replaces the template."""
 
     folder: Annotated[str | None, NOT_HASHED] = None  # with case.yaml
-    folder_sha256: str | None = "${valve_folder:}"  # of what lies there
-    # Shortening of the anteroposterior diameter while the valve closes, of a case without a closed
-    # frame; the papillary tips stay.
+    folder_sha256: str | None = "${valve_folder:}"  # of its files
+    # Shortening of the anteroposterior diameter while the valve closes, for a case without a
+    # closed frame; the papillary tips stay.
     annulus_contraction: Share = 0.0
 
 
 def folder_hash(folder: str | None) -> str | None:
-    """SHA-256 over the files of a case folder; None where there is none to read."""
+    """SHA-256 over the files of a case folder; None if there is no case."""
     if not folder:
         return None
     from mvest.cases.schema import files_of_case
@@ -59,10 +59,7 @@ def folder_hash(folder: str | None) -> str | None:
 def anatomy_of(config: Values) -> Anatomy:
     """The configured anatomy.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible, or the case is not in order.
+    Raises an `MvestError` if a setting is inadmissible, or the case is faulty.
     """
     given = config["valve"]
     if given.get("folder") is None:
@@ -81,10 +78,7 @@ def anatomy_of(config: Values) -> Anatomy:
 def template_of(config: Values) -> Template:
     """The configured template.
 
-    Raises
-    ------
-    ConfigurationError
-        If the anatomy is that of a case folder, which has no parameters.
+    Raises a `ConfigurationError` if the anatomy is that of a case folder.
     """
     if config["valve"].get("folder") is not None:
         raise ConfigurationError(
@@ -96,8 +90,8 @@ def template_of(config: Values) -> Template:
 
 @cache
 def _of_folder(folder: str, _sha256: str | None, contraction: float) -> GivenValve:
-    """The anatomy of a case, read once as long as its files are the same."""
-    # What reads cases is as large as all that Table 1 needs of the valve.
+    """The anatomy of a case; read once while its files do not change."""
+    # The reader of cases is as large as everything that Table 1 needs of the valve.
     from mvest.cases.folder import read_case
     from mvest.scenarios.scenario import narrowed, plane_of
     from mvest.valve.mesh.given import GivenValve
@@ -121,7 +115,7 @@ def _of_folder(folder: str, _sha256: str | None, contraction: float) -> GivenVal
 def upright(valve: Valve) -> Valve:
     """A valve in the axes of the template: annulus about z = 0, first leaflet at y > 0, tips below.
 
-    Pictures and errors of an observation are in these axes.
+    Figures and errors of an observation use these axes.
     """
     from mvest.scenarios.scenario import plane_of
 
@@ -132,11 +126,10 @@ def upright(valve: Valve) -> Valve:
         return np.asarray((points - plane.origin) @ axes)
 
     surface, motion = valve.surface, valve.motion
+    fibre = np.asarray(surface.fibre @ axes)
     return replace(
         valve,
-        surface=replace(
-            surface, vertices=turned(surface.vertices), fibre=np.asarray(surface.fibre @ axes)
-        ),
+        surface=replace(surface, vertices=turned(surface.vertices), fibre=fibre),
         papillary_tips=turned(valve.papillary_tips),
         chordae=replace(valve.chordae, insertion=turned(valve.chordae.insertion)),
         motion=Motion(motion.phase, turned(motion.annulus), turned(motion.papillary_tips)),
@@ -144,10 +137,10 @@ def upright(valve: Valve) -> Valve:
 
 
 def guide_of(model: ClosureModel, anatomy: Anatomy, mesh: Values) -> ClosureModel | None:
-    """The model on a mesh of half as many cells each way, guided itself; None at the coarsest.
+    """The model on a mesh of half as many cells each way, with its own guide; None at the coarsest.
 
-    Guides have solid-shells, whatever the element and the source of the model's mesh. Without two
-    leaflets there is none.
+    Guides have solid-shells, whatever the element and source of the model's mesh. A valve without
+    two leaflets has none.
     """
     shape = anatomy if isinstance(anatomy, Template) else anatomy.band
     if mesh["columns"] <= COARSEST[0] or shape is None:
@@ -182,9 +175,9 @@ def build_mesh(anatomy: Anatomy, mesh: Values, element: str, store: Path) -> Sol
 
 
 def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureModel:
-    """The configured model of the closure, with one variation.
+    """The configured model of the closure, with one variation of the gate.
 
-    It closes the open valve each time, unless its user sets a continuation.
+    It closes the open valve anew for all parameters, unless the caller sets a continuation.
     """
     anatomy, settings = anatomy_of(config), mechanics_of(config)
     observed, points = config["observation"], config["mechanics"]["contact_points"]
@@ -209,7 +202,7 @@ def mechanics_of(config: Values) -> MechanicsSettings:
 
 
 def _varied(grid: Values, factor: float) -> dict[str, int]:
-    """Columns, an even number, and rows multiplied by a factor."""
+    """Columns (an even number) and rows multiplied by a factor."""
     columns, rows = grid["columns"], grid["rows"]
     if factor == 1.0:
         return {"columns": columns, "rows": rows}

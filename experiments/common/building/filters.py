@@ -1,7 +1,8 @@
-"""The configured filter, its coordinates and its prior."""
+"""The configured filter, its coordinates, its prior and the noise that it assumes."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from importlib import import_module
 from typing import Any
 
@@ -17,19 +18,22 @@ from mvest.mechanics.parameters import is_positive
 from mvest.reading.text import one_line
 from mvest.typing import FloatArray
 
-OURS = "mvest.estimation.filters."
-
 
 def build_filter(
     settings: Values, parameters: tuple[str, ...], *, positive: bool = False
 ) -> tuple[Filter, Transform, Gaussian]:
     """The filter, its coordinates, and the prior of the parameters.
 
-    Those of our mechanics are known to be positive or not; those of another model are ``positive``.
+    The registered parameters of the mechanics are known to be positive or not; ``positive`` says
+    it for those of another model.
     """
-    mean = np.array(settings["initial"], dtype=float)
+    mean, P0 = np.array(settings["initial"], dtype=float), settings["P0"]
     require_one_each("filter.initial", mean, parameters)
-    prior = _gaussian("filter.P0", mean, settings["P0"])
+    numbers = _as_numbers("filter.P0", P0)
+    try:
+        prior = Gaussian.from_variance(mean, numbers)
+    except InputError as error:
+        raise ConfigurationError(f"filter.P0 = {P0}: {error}") from error
     transform: Transform = Identity()
     if settings["transform"] == "log":
         transform = Log(None if positive else tuple(map(is_positive, parameters)))
@@ -40,18 +44,14 @@ def build_filter(
 def filter_of(method: Values) -> Filter:
     """The filter that ``_target_`` names, with its settings.
 
-    Raises
-    ------
-    ConfigurationError
-        If there is no such filter, or a setting is none of its or inadmissible.
+    Raises a `ConfigurationError` if there is no such filter, or it has no such setting.
     """
     target, settings = method.get("_target_"), {k: v for k, v in method.items() if k != "_target_"}
     module, _, name = str(target).rpartition(".")
-    try:
-        # Not even imported where the name is not ours.
-        kind = getattr(import_module(module), name) if module.startswith(OURS) else None
-    except (ImportError, AttributeError):
-        kind = None
+    kind: Any = None
+    if module.startswith("mvest.estimation.filters."):  # import no other code
+        with suppress(ImportError):
+            kind = getattr(import_module(module), name, None)
     if not (isinstance(kind, type) and issubclass(kind, Filter)):
         raise ConfigurationError(
             f"filter.method: _target_ {target!r}, expected the full name of a filter, for example "
@@ -64,20 +64,11 @@ def filter_of(method: Values) -> Filter:
 
 
 def require_one_each(name: str, values: FloatArray, parameters: tuple[str, ...]) -> None:
-    """Refuse a setting that has not one value for each parameter."""
+    """Refuse a setting that does not have one value for each parameter."""
     if values.shape != (len(parameters),):
         raise ConfigurationError(
             f"{name} has {values.size} values; expected one for each of {', '.join(parameters)}"
         )
-
-
-def _gaussian(name: str, mean: FloatArray, variance: Any) -> Gaussian:
-    """Prior with one variance, one for each parameter, or a full covariance."""
-    numbers = _as_numbers(name, variance)
-    try:
-        return Gaussian.from_variance(mean, numbers)
-    except InputError as error:
-        raise ConfigurationError(f"{name} = {variance}: {error}") from error
 
 
 def observation_variance(R: Any) -> float | FloatArray:
@@ -91,7 +82,6 @@ def observation_variance(R: Any) -> float | FloatArray:
 
 
 def _as_numbers(name: str, value: Any) -> float | FloatArray:
-    """A setting that is a number, or an array of them."""
     try:
         numbers = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -42,13 +42,13 @@ COLUMNS = {
     "smallest det F": ":.2f",
     "Newton iterations": "",
 }
-"""Units of what `mvest.scenarios.measures.measure_steps` measures."""
+"""Columns of `mvest.scenarios.measures.measure_steps`, with units and digits."""
 
 
 def gate_report(values: Values) -> GateReport:
-    """Close the configured anatomy with its true moduli under variations that must not matter.
+    """Close the configured anatomy with its true moduli, under variations that must not matter.
 
-    Each result is printed to standard error as soon as it is known.
+    Each result is printed to standard error at once.
     """
     return run_gate(
         lambda case: closure_model(values, case),
@@ -60,15 +60,15 @@ def gate_report(values: Values) -> GateReport:
 
 
 def closures_of(report: GateReport) -> int:
-    """How many closures a report took."""
+    """Number of closures that a report needed."""
     return len(report.rows) + sum(path.closures for path in report.paths)
 
 
 def gate_rows(report: GateReport) -> Table:
     """A row for each variation, and for each path along moduli (``along E_f``).
 
-    The largest distance of a path is what the derivatives do not explain at any one vertex; of it
-    there is also the share of the whole way.
+    ``max`` of a path is the largest motion of a vertex that the derivatives do not explain, and
+    ``share`` its share of the whole motion.
     """
     rows = [
         {"variation": r.case, "mean": r.mean_mm, "max": r.max_mm, "passed": r.passed}
@@ -89,7 +89,7 @@ def gate_rows(report: GateReport) -> Table:
 
 
 def anatomy_digest(values: Mapping[str, Any]) -> str:
-    """SHA-256 of the configured anatomy, whatever its file is called."""
+    """SHA-256 of the configured anatomy, independent of file names."""
     given = values["valve"]
     if given.get("folder") is not None:
         return content_digest(given["folder_sha256"] or "", given["annulus_contraction"])
@@ -97,30 +97,24 @@ def anatomy_digest(values: Mapping[str, Any]) -> str:
 
 
 def gate_of(values: Mapping[str, Any], records: Path = GATE_RECORDS) -> str:
-    """The verdict on the configured anatomy and the mesh it was reached on, or `NOT_GATED`.
+    """The verdict on the configured anatomy, with its mesh; `NOT_GATED` if there is none.
 
-    Parameters
-    ----------
-    values : mapping
-        The resolved configuration.
-    records : Path
-        Published records of the gate, one a line.
+    ``records`` is the file of published records of the gate, one a line.
     """
     return _verdicts(records).get(anatomy_digest(values), NOT_GATED)
 
 
 @cache
 def _verdicts(records: Path) -> dict[str, str]:
-    """Digest of an anatomy -> the gate's verdict; a damaged record has none."""
+    """Digest of an anatomy -> the gate's verdict; damaged records are left out."""
     found: dict[str, str] = {}
     for line in records.read_bytes().splitlines() if records.is_file() else ():
         try:
             record = json.loads(line)["record"]
             cells, element = record["model"]["cells"], record["model"]["element"]
             passed = PASSED_GATE if record["numbers"]["passed"] is True else FAILED_GATE
-            found[str(record["numbers"]["anatomy"])] = (
-                f"{passed} on {cells[0]} x {cells[1]} {element}"
-            )
+            verdict = f"{passed} on {cells[0]} x {cells[1]} {element}"
+            found[str(record["numbers"]["anatomy"])] = verdict
         except (ValueError, KeyError, TypeError, IndexError):
             continue
     return found
@@ -145,7 +139,7 @@ class Closing:
 
     @property
     def contact_distance_mm(self) -> float:
-        """Between midsurfaces, up to which leaflets count as coapting."""
+        """Largest distance of midsurfaces at which leaflets count as coapting."""
         contact, surface = self.model.settings.contact, self.model.valve.surface
         share = contact.reference_distance + contact.activation_distance
         return 0.5 * share * float(surface.thickness.mean())
@@ -157,7 +151,7 @@ class Closing:
         return replace(self, result=replace(self.result, simulation=two))
 
     def steps(self) -> Table:
-        """What is measured of each step (`mvest.scenarios.measures.measure_steps`)."""
+        """Measures of each step (`mvest.scenarios.measures.measure_steps`)."""
         steps = measure_steps(self.model, self.result, self.contact_distance_mm, self.normals)
         return table(steps, **COLUMNS)
 
@@ -170,7 +164,7 @@ class Closing:
         loading = boundary_loading(system, valve, model.contact_valve, model.settings)
         assert system.cables is not None
         pressed = [contact_pressure(system, x) for x in simulation.frames]
-        # The samples are finer than the surface, whose two faces lie over the same ones.
+        # Both faces of a vertex take the value of the nearest contact sample.
         at_face = np.tile(cKDTree(pressed[0][0]).query(valve.surface.vertices)[1], 2)
         moving = {
             "stress": [faces(nodal_stress(system, x)) for x in simulation.frames],
@@ -186,7 +180,7 @@ class Closing:
             # Along the atrial faces.
             "annulus": valve.annulus + len(valve.surface.vertices),
             "chord_tip": system.cables.tip,
-            # Of faces, which are half a thickness nearer than midsurfaces on both sides.
+            # Between faces, each half a thickness nearer than its midsurface.
             "reach_mm": np.array(
                 model.contact_reach_mm - valve.surface.thickness[valve.free_edge].mean()
             ),
@@ -194,15 +188,7 @@ class Closing:
 
 
 def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
-    """Close the configured valve with the configured moduli of the truth.
-
-    Parameters
-    ----------
-    values : mapping
-        The resolved configuration.
-    name : str
-        Of the progress bar.
-    """
+    """Close the configured valve with the true moduli; ``name`` is shown with the progress."""
     model = closure_model(values)
     truth = np.array(values["truth"]["values"], dtype=float)
     with SolveBar(name, len(model.settings.protocol.steps()), 1) as bar:
@@ -221,7 +207,7 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
     path : Path
         An ``.npz`` file with `Closing.arrays`.
     steps : mapping of int to str
-        Number of a step -> its title. What leaks of the last one is painted.
+        Number of a step -> its title. The open orifice of the last one is painted.
     names : sequence of str
         Of the leaflets.
 

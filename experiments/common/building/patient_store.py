@@ -1,4 +1,4 @@
-"""Virtual patients on disk: simulated once, the case apart from what it hides."""
+"""Virtual patients on disk: simulated once, with the case and its truth in separate folders."""
 
 from __future__ import annotations
 
@@ -32,56 +32,45 @@ MAX_DRAWS = 5
 
 @dataclass(frozen=True, slots=True)
 class PatientPlace:
-    """Where a virtual patient lies: the folder that an estimator is given, and the sealed one."""
+    """Folders of a virtual patient: the case, which an estimator gets, and the sealed truth."""
 
     case: Path
     hidden: Path
 
     def truth(self) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-        """What the case does not say, and frame -> ``(n, 3)`` mm of where its vertices truly were.
+        """The truth, and frame -> ``(n, 3)`` mm, the true positions of its vertices.
 
-        Raises
-        ------
-        InputError
-            If the patient hides nothing.
+        Raises an `InputError` if it is not there.
         """
         try:
             return read_mapping(self.hidden / HIDDEN), read_npz(self.hidden / POSITIONS)
         except InputError as error:
-            raise InputError(
-                f"{self.hidden} does not hold what a patient hides: {error}"
-            ) from error
+            raise InputError(f"{self.hidden} does not hold a patient's truth: {error}") from error
 
 
 def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:
-    """Simulate the configured patient, unless that was done: where it lies.
+    """Simulate the configured patient, unless it is cached; returns its folders.
 
-    Raises
-    ------
-    ConfigurationError
-        If none is configured.
+    Raises a `ConfigurationError` if none is configured.
     """
     if patient is None:
         raise ConfigurationError("patient is not given; expected one of conf/patient")
     described = {
         "patient": {k: v for k, v in values["patient"].items() if not k.startswith("paper")},
-        "valve": values["valve"],
-        "mechanics": values["mechanics"],
-        "seed": values["seed"],
+        **{key: values[key] for key in ("valve", "mechanics", "seed")},
     }
     folder = Path(values["paths"]["outputs"]) / "virtual"
-    entry = entry_of(folder, described, (_simulate, _write), _place, "{key}")
+
+    def read(root: Path) -> PatientPlace:
+        place = PatientPlace(root / "case", root / "hidden")
+        read_mapping(place.hidden / HIDDEN)
+        return place
 
     def write(root: Path, made: tuple[VirtualPatient, int]) -> None:
         _write(root, *made, described)
 
+    entry = entry_of(folder, described, (_simulate, _write), read, "{key}")
     return entry.get_or_make(lambda: _simulate(values, patient), write)
-
-
-def _place(root: Path) -> PatientPlace:
-    place = PatientPlace(root / "case", root / "hidden")
-    read_mapping(place.hidden / HIDDEN)
-    return place
 
 
 def _simulate(values: Values, patient: PatientSettings) -> tuple[VirtualPatient, int]:

@@ -1,7 +1,4 @@
-"""A synthetic study: the estimator's model and, apart from it, what makes the observation.
-
-``check=true`` answers with the Fisher information of the same study.
-"""
+"""A synthetic study: the estimator's model and, separate from it, the observation's."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ from experiments.common.schema import Values
 from mvest.cache import content_digest
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.prediction import ObservationModel, SharedStart
+from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
@@ -53,7 +50,7 @@ from mvest.valve.anatomy.valve import LeafletSurface, Valve
 def build_truth(
     config: Values, plain: ClosureModel, settings: MechanicsSettings, anatomy: Anatomy
 ) -> tuple[ClosureModel, StoredModel | Extrapolated]:
-    """The model that the observation is made from, and the same behind its cache."""
+    """The model that makes the observation, and the same model with a cache on disk."""
     truth, element = config["truth"], config["mechanics"]["element"]
     changed, other = truth_mesh(config["mesh"], truth), truth["element"] or element
     coarser = list(truth["extrapolated_from"])
@@ -66,7 +63,7 @@ def build_truth(
             settings=settings,
             fixed={**config["fixed"], **truth["fixed"]},
         )
-        if coarser:  # meshes as fine as these take minutes from the open valve
+        if coarser:  # from the open valve, meshes as fine as these take minutes
             model.guide = guide_of(model, anatomy, mesh)
         decisive = model.valve, model.contact_valve, model.mesh, settings, model.names, model.fixed
         described = {"model": content_digest(*decisive), "guided": bool(coarser)}
@@ -112,24 +109,25 @@ def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSett
 
 def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
     """The estimator's mesh settings with the truth's changes."""
-    changed = dict(mesh)
-    changed["source"] = truth["source"] or mesh["source"]
-    changed["edge_length"] = mesh["edge_length"] / truth["refine"]
-    for name in ("columns", "rows"):
-        given = truth[name]
-        changed[name] = mesh[name] * truth["refine"] if given is None else given
-    changed["layers"] = mesh["layers"] if truth["layers"] is None else truth["layers"]
-    return changed
+    refined = {name: mesh[name] * truth["refine"] for name in ("columns", "rows")}
+    own = {name: truth[name] for name in ("columns", "rows", "layers") if truth[name] is not None}
+    return {
+        **mesh,
+        **refined,
+        **own,
+        "source": truth["source"] or mesh["source"],
+        "edge_length": mesh["edge_length"] / truth["refine"],
+    }
 
 
 MADE_BY = (closure_model, truth_mechanics, truth_mesh)
-"""What makes the closures of a configured valve."""
+"""The code whose source is part of the key of a cached closure."""
 
 
 def observation_errors(
     settings: Values, surface: LeafletSurface, correlated: Callable[[float], SpatialCorrelation]
 ) -> tuple[ObservationError, ...]:
-    """The configured errors that are not zero, in the order in which they arise."""
+    """The configured errors of an observation, in the order in which they arise."""
     offset = settings["annulus_offset_mm"]
     made: list[ObservationError] = [AnnulusOffset(tuple(offset))] if np.any(offset) else []
     made.append(WhiteNoise(settings["noise_mm"]))
@@ -143,24 +141,21 @@ def observation_errors(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Twin:
-    """A synthetic study: the estimator's case, and apart from it what makes its observation.
+    """A synthetic study.
 
     Attributes
     ----------
     problem : Problem
-    model : ClosureModel
-        The estimator's.
-    truth_model : ClosureModel
-        The observation's; an object of its own.
+        The estimation problem, which knows nothing of the truth.
+    model, truth_model : ClosureModel
+        The estimator's, and a separate one that makes the observation.
     source : StoredModel or Extrapolated
-        ``truth_model`` behind its cache on disk, extrapolated to zero mesh size if requested.
+        ``truth_model`` with its cache, extrapolated to zero mesh size if requested.
     truth_values : (p,)
     valve : Valve
         The observed surface.
-    variance : float or (f,) mm²
-    correlation : SpatialCorrelation or None
-    frames : tuple of str
-    errors : tuple of ObservationError
+    observe : callable
+        (model, values= ``(p,)``, rng=) -> an observation of what the model predicts there.
     """
 
     problem: Problem
@@ -169,67 +164,42 @@ class Twin:
     source: StoredModel | Extrapolated
     truth_values: FloatArray
     valve: Valve
-    variance: float | FloatArray
-    correlation: SpatialCorrelation | None
-    frames: tuple[str, ...]
-    errors: tuple[ObservationError, ...]
-
-    def observe(
-        self, model: ObservationModel, values: FloatArray, rng: np.random.Generator
-    ) -> TwinData:
-        """An observation made from what a model predicts at parameters ``(p,)``."""
-        return simulate_observation(
-            model,
-            self.problem.parameters,
-            values,
-            frames=self.frames,
-            variance=self.variance,
-            correlation=self.correlation,
-            errors=self.errors,
-            rng=rng,
-        )
+    observe: Callable[..., TwinData]
 
 
 def build_twin(config: Values) -> Twin:
-    """Everything of a synthetic study.
+    """A synthetic study from its configuration.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible; the message names it.
+    Raises an `MvestError` if a setting is inadmissible; the message names it.
     """
-    parameters = tuple(config["parameters"])
-    truth = config["truth"]
-    settings = mechanics_of(config)
-    # What is cheap to refuse is refused before anything is meshed.
+    parameters, truth = tuple(config["parameters"]), config["truth"]
+    settings, R = mechanics_of(config), config["filter"]["R"]
+    # Cheap checks come before anything is meshed.
     filter_, transform, prior = build_filter(config["filter"], parameters)
-    variance = observation_variance(config["filter"]["R"])
+    variance = observation_variance(R)
     frames = tuple(config["observation"]["frames"])
     require_frames(frames)
     if np.size(variance) not in (1, len(frames)):
         raise ConfigurationError(
-            f"filter.R = {config['filter']['R']}: R has shape ({np.size(variance)},); expected one "
-            f"variance, or one for each of the {len(frames)} observed frames"
+            f"filter.R = {R}: R has shape ({np.size(variance)},); expected one variance, or one "
+            f"for each of the {len(frames)} observed frames"
         )
     values = np.array(truth["values"], dtype=float)
     require_one_each("truth.values", values, parameters)
     linear_solver(settings.solver)
     true_settings = truth_mechanics(settings, truth)
 
-    anatomy = anatomy_of(config)
-    observation = config["observation"]
+    anatomy, observation = anatomy_of(config), config["observation"]
     valve = anatomy.valve(observation["columns"], observation["rows"])
     check_parameters([*parameters, *config["fixed"], *truth["fixed"]], valve, settings)
-    # Each length is factorised once.
+    # Factorised once for each length.
     correlated = cache(partial(SpatialCorrelation, valve.surface.vertices))
     errors = observation_errors(observation, valve.surface, correlated)
     assumed_length = config["filter"]["R_correlation_mm"]
     correlation = correlated(assumed_length) if assumed_length else None
-    plain = closure_model(config)
+    plain, reach = closure_model(config), config["continuation_reach"]
     model = replace(
-        plain,
-        continuation=config["continuation"],
-        reach=np.inf if config["continuation_reach"] is None else config["continuation_reach"],
+        plain, continuation=config["continuation"], reach=np.inf if reach is None else reach
     )
     if config["guided"]:
         model.guide = guide_of(model, anatomy, config["mesh"])
@@ -237,36 +207,33 @@ def build_twin(config: Values) -> Twin:
     truth_model, source = build_truth(config, plain, true_settings, anatomy)
     for own, point in ((model, prior.mean), (model, values), (truth_model, values)):
         given = dict(zip(parameters, map(float, point), strict=True))
-        material_law(own.mesh, own.settings, {**own.fixed, **given})  # refuses what is none
-    problem = Problem(parameters, model, prior, filter_, transform, settings.tissue)
+        material_law(own.mesh, own.settings, {**own.fixed, **given})  # refuses inadmissible ones
     return Twin(
-        problem,
-        model,
-        truth_model,
-        source,
-        values,
-        valve,
-        variance,
-        correlation,
-        frames,
-        errors,
+        problem=Problem(parameters, model, prior, filter_, transform, settings.tissue),
+        model=model,
+        truth_model=truth_model,
+        source=source,
+        truth_values=values,
+        valve=valve,
+        observe=partial(
+            simulate_observation,
+            parameters=parameters,
+            frames=frames,
+            variance=variance,
+            correlation=correlation,
+            errors=errors,
+        ),
     )
 
 
 def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[StudyResult]:
-    """One estimate for each seed of the errors; simulation and first closure are shared.
+    """One estimate for each seed of the errors; they share the truth and the first closure.
 
-    Parameters
-    ----------
-    twin : Twin
-    seeds : sequence of int
-    name : str
-        Shown with the progress.
+    ``name`` is shown with the progress.
     """
     of_name = f", {name}" if name else ""
-    with SolveBar(
-        f"observation{of_name}", len(twin.truth_model.settings.protocol.steps()), 1
-    ) as bar:
+    steps = len(twin.truth_model.settings.protocol.steps())
+    with SolveBar(f"observation{of_name}", steps, 1) as bar:
         twin.truth_model.on_step = bar.step
         truth = twin.source(twin.truth_values)
     problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
@@ -275,7 +242,8 @@ def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[Stud
     with SolveBar(f"estimation{of_name}", steps, solves, problem.parameters) as bar:
         twin.model.on_step = bar.step
         for seed in seeds:
-            data = twin.observe(lambda m: truth, twin.truth_values, np.random.default_rng(seed))
+            rng = np.random.default_rng(seed)
+            data = twin.observe(lambda m: truth, values=twin.truth_values, rng=rng)
             if data.observation is None:
                 return [StudyResult.failed(twin.problem, data.reason) for _ in seeds]
             result = estimate(problem, data.observation, on_iterate=bar.iterate)
@@ -292,16 +260,15 @@ def expect_twin(config: Values, _folder: Path | None = None) -> str:
         twin.model.on_step = bar.step
         first = model(start)
     title = f"{config['name']}, {config['row']}"
-    data = twin.observe(model, start, np.random.default_rng(0))
+    data = twin.observe(model, values=start, rng=np.random.default_rng(0))
     if data.observation is None:
         return unknown_text(title, first.reason)
     std = np.sqrt(np.atleast_1d(np.asarray(config["filter"]["R"], dtype=float)))
     noise = noise_words("assumed", std.tolist(), config["filter"]["R_correlation_mm"])
-    problem = replace(twin.problem, model=model)
-    return expectation_text(title, problem, data.observation, noise)
+    return expectation_text(title, replace(twin.problem, model=model), data.observation, noise)
 
 
 def noise_words(known: str, std_mm: Sequence[float], length_mm: float) -> str:
-    """How well coordinates are "assumed" or "stated" to be seen."""
+    """The noise of coordinates in words; it is "assumed" or "stated"."""
     errors = f"correlated over {length_mm:g} mm" if length_mm else "independent"
     return f"{' and '.join(f'{s:.3g}' for s in std_mm)} mm of noise {known}, {errors}"

@@ -1,10 +1,9 @@
 """Estimates a case in a process that cannot open what the case hides.
 
-A virtual patient's truth lies in a folder of its own. This process is started for the estimation
-alone, is given nothing of the patient but the folder of its case, and refuses to open, list or
-rename anything within the sealed folder for as long as it lives: Python's audit hooks cannot be
-removed once they are set (PEP 578). They see what Python opens; a file that a compiled library or a
-program started from here opened by itself would not be seen.
+The truth of a virtual patient lies in a separate folder. This process runs one estimation, is given
+only the folder of the case, and refuses to open, list or rename anything within the sealed folder.
+Python's audit hooks cannot be removed once they are set (PEP 578). They see what Python opens, not
+what a compiled library or a child program opens by itself.
 """
 
 from __future__ import annotations
@@ -39,18 +38,17 @@ from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
 
 ESTIMATE, ARRAYS = "estimate.json", "estimate.npz"
-"""What the process leaves in the output folder."""
+"""Files that the process writes into the output folder."""
 
 MAX_MEMORY = 10 * 2**30
-"""Bytes that the process may ask for: a leaflet that crumples while no equilibrium is found can
-take all there is, and what else runs on the machine with it."""
+"""Bytes that the process may allocate. A leaflet that crumples can take all memory there is."""
 
 SECRET = ("patient", "echo", "truth", "valve", "seed", "parameters", "row", "factors")
-"""Parts of a configuration that describe the patient, and that the estimator is not given."""
+"""Parts of a configuration that describe the patient; the estimator does not get them."""
 
 
 def seal(folder: Path) -> None:
-    """From now on let this process open nothing within ``folder``."""
+    """Refuse, from now on, to open anything within ``folder`` in this process."""
     sealed = os.path.realpath(folder)
 
     def refuse(event: str, arguments: tuple[Any, ...]) -> None:
@@ -60,7 +58,7 @@ def seal(folder: Path) -> None:
             if not isinstance(argument, (str, bytes, os.PathLike)):
                 continue
             path = os.path.realpath(os.fsdecode(argument))
-            # Under another name of a folder above, the sealed one would not be known again.
+            # If a folder above got another name, the sealed one would no longer be recognised.
             renamed = event in ("os.rename", "shutil.move") and sealed.startswith(path + os.sep)
             if renamed or path == sealed or path.startswith(sealed + os.sep):
                 raise PermissionError(f"{path} is sealed: an estimator does not see the truth")
@@ -71,12 +69,12 @@ def seal(folder: Path) -> None:
 def estimate_blindly(
     values: Mapping[str, Any], folder: Path, case: Path, sealed: Path, gate: str = NOT_GATED
 ) -> Result:
-    """Personalise a case, or the valve in a volume, in a process apart.
+    """Personalise a case, or the valve in a volume, in a separate process.
 
     Parameters
     ----------
     values : mapping
-        The configuration; what describes the patient is left out.
+        The configuration; the parts that describe the patient are left out.
     folder : Path
         Output folder of the job, which exists.
     case : Path
@@ -89,7 +87,7 @@ def estimate_blindly(
     Raises
     ------
     InputError
-        If the process left no result; the message ends with its last words.
+        If the process left no result; the message ends with its last line of output.
     """
     given = {"volume": str(case)} if case.is_file() else {"case": str(case)}
     request = {
@@ -117,19 +115,16 @@ def estimate_blindly(
 
 
 def read_estimate(folder: Path) -> Result:
-    """What the process left in the output folder.
+    """The result that the process wrote into the output folder.
 
-    Raises
-    ------
-    InputError
-        If it left nothing.
+    Raises an `InputError` if there is none.
     """
     left, arrays = read_mapping(folder / ESTIMATE), folder / ARRAYS
     return Result(**left, arrays=read_npz(arrays) if arrays.is_file() else {})
 
 
 def write_estimate(folder: Path, result: Result) -> None:
-    """Leave the result of a case for `read_estimate`."""
+    """Write the result of a case for `read_estimate`."""
     if result.arrays:
         arrays: dict[str, Any] = dict(result.arrays)
         write_atomically(folder / ARRAYS, partial(np.savez_compressed, **arrays))
@@ -142,7 +137,7 @@ def main() -> int:
     resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, hard))
     request = json.load(sys.stdin)
     folder = Path(request["folder"])
-    # The configuration describes the patient, too.
+    # The written configuration describes the patient, too.
     for place in (Path(request["sealed"]), folder / ".hydra", folder.parent / ".hydra"):
         seal(place)
     values = request["values"]

@@ -1,15 +1,14 @@
-"""A configured case, or the valve in a configured volume: settings, check, and result of a run."""
+"""A configured case, or the valve in a configured volume: settings, check and result."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from experiments.common.building.closure import mechanics_of, mesh_store
-from experiments.common.progress import PartBar, SolveBar
+from experiments.common.progress import PartBar, SolveBar, say
 from experiments.common.records.record import (
     FIELDS,
     NOT_GATED,
@@ -51,12 +50,12 @@ from mvest.problem.registration import REGISTRATION
 from mvest.quantities import Value
 from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
 
-TYPICAL_SOLVES = 8
-"""Forward solves of one case; only the progress bar's first guess."""
+WHOLE = 50.0
+"""Time of a personalisation in units of its first closure; the example case took 52."""
 
 
 def _content_of(files_of: Callable[[Path], Any]) -> Reads:
-    """Marks a setting that names what ``files_of`` finds the files of."""
+    """Marks a setting whose files ``files_of`` lists."""
     return Reads(lambda value, _: contents(files_of(Path(value))) or value)
 
 
@@ -69,7 +68,7 @@ VolumeInput = Annotated[str | None, _content_of(files_of_volume)]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UnknownSettings:
-    """One quantity that is not known of a case: its prior, and what becomes of it."""
+    """An unknown quantity of a case: its prior, and whether it is estimated."""
 
     mean: Value
     std: Value
@@ -78,7 +77,7 @@ class UnknownSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PersonalSettings(CaseChoices):
-    """How a case is personalised; errors are learned where a configuration says how well known."""
+    """How a case is personalised; with ``errors`` the noise is learned from these beliefs."""
 
     unknowns: dict[str, UnknownSettings] = field(default_factory=dict)
     errors: ErrorBeliefs | None = None
@@ -86,7 +85,7 @@ class PersonalSettings(CaseChoices):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImagedInput(ImagedSettings):
-    """From a volume to a case; what the settings name is read for the hash."""
+    """From a volume to a case; the hash depends on the content of the named files."""
 
     model: InputFile = None
     package_model: str | None = "${package_model:}"  # SHA-256 of the one for ultrasound
@@ -94,13 +93,7 @@ class ImagedInput(ImagedSettings):
 
 
 def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettings:
-    """How the configuration wants a case to be personalised.
-
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible.
-    """
+    """The configured settings of a personalisation."""
     unknowns = tuple(
         Prior(name, about.mean, about.std, about.treatment == "fixed")
         for name, about in personal.unknowns.items()
@@ -128,19 +121,18 @@ def run_case(
 ) -> Result:
     """Personalise a case; ``gate`` is the verdict of the gate on its anatomy."""
     for sentence in () if images else case.derived:
-        print(f"derived: {sentence}", file=sys.stderr)
+        say(f"derived: {sentence}")
     for value in implausible_values(case):
-        print(f"implausible: {value}", file=sys.stderr)
+        say(f"implausible: {value}")
     settings = with_pressures(case, settings_of(values, personal))
     steps = len(settings.mechanics.protocol.steps())
     free = [u.name for u in settings.unknowns if not u.fixed]
-    # As they are estimated: those of the closure first.
-    names = sorted(free, key=lambda name: name in REGISTRATION)
-    with SolveBar(case.name, steps, TYPICAL_SOLVES, names) as bar:
+    names = sorted(free, key=lambda name: name in REGISTRATION)  # the order of estimation
+    with SolveBar(case.name, steps, 0, names, WHOLE) as bar:
         fit = personalise(
             case, settings, store=mesh_store(values), on_step=bar.step, on_iterate=bar.iterate
         )
-    grid, noise = settings.mesh, case.uncertainty.typical_mm
+    grid = settings.mesh
     estimate = record_of_case(fit, gate=has_passed(gate), images=images)
     return Result(
         tables={"": unknown_table(estimate.unknowns), "frames": frame_table(estimate.frames)},
@@ -158,7 +150,7 @@ def run_case(
             cells=(grid.columns, grid.rows, 1),
             source=grid.source,
             filter="iterated",
-            noise_mm=noise,
+            noise_mm=case.uncertainty.typical_mm,
         ),
         gate=gate,
     )
@@ -176,7 +168,7 @@ def run_volume(
 
     detected = find_valve(file, imaged, folder)
     for sentence in detected.sentences:
-        print(sentence, file=sys.stderr)
+        say(sentence)
     images = write_image_step(detected, folder)
     return run_case(values, personal, read_case(folder / CASE), images)
 
@@ -184,7 +176,7 @@ def run_volume(
 def find_valve(
     file: str | None, imaged: ImagedInput, folder: Path, *, estimate: bool = True
 ) -> DetectedValve:
-    """The valve in the configured volume; a candidate that is not accepted is drawn.
+    """The valve in the configured volume. A rejected candidate is drawn.
 
     Raises
     ------
@@ -212,12 +204,12 @@ def find_valve(
 
 
 def case_words(record: Record) -> str:
-    """What a finished case says on the terminal: the verdict first."""
+    """The text of a finished case for the terminal, with the verdict first."""
     return estimate_text(record.estimates[0])
 
 
 def write_report(folder: Path, record: Record) -> list[Path]:
-    """The report of a run's first estimate, and its arrays drawn in it."""
+    """Write the report of a run's first estimate."""
     from mvest.reporting.case.report import report
 
     fields = folder / FIELDS
@@ -231,19 +223,10 @@ def write_report(folder: Path, record: Record) -> list[Path]:
 
 
 def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) -> str:
-    """Check and draw a case, and say what an estimate of it could tell.
+    """Check and draw a case, and predict how well its moduli could be estimated.
 
-    ``check.html`` in the folder says the same.
-
-    Parameters
-    ----------
-    values : mapping
-        The configuration.
-    case : ValveCase
-    folder : Path
-        Of the run.
-    gate : bool
-        Whether to test that its closed state is the only one, which takes minutes.
+    The folder of the run gets the same as ``check.html``. With ``gate`` it is tested for minutes
+    whether the closed state is the only one.
     """
     from mvest.reporting.case.figures import frames_figure
     from mvest.reporting.case.report import check_page
@@ -256,7 +239,9 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
     drawn = save_figure_with(folder / "case", figure, f"case {case.sha256[:12]}")
     lines = _described(case)
     if gate:
-        lines += gate_lines(gate_case(case, settings, mesh_store(values)))
+        with PartBar(f"{case.name}, gate", 1, "test") as bar:
+            lines += gate_lines(gate_case(case, settings, mesh_store(values)))
+            bar.step()
     strange = implausible_values(case)
     lines += [f"{'MISTAKE?' if one.mistake else 'implausible'}: {one}" for one in strange]
     lines.append(
@@ -273,12 +258,12 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
     page = check_page(folder, case.name, lines, expected, drawn[-1])
     tables = expected_tables(expected) if expected.unknowns else {}
     texts = [f"{name}\n{one.text()}" for name, one in tables.items()]
-    lacking = [f"what an estimate could tell is not known: {expected.reason}"]
+    lacking = [f"how well moduli could be estimated is not known: {expected.reason}"]
     return "\n".join([case.name, *lines, *(texts or lacking), f"drawn and written: {page}"])
 
 
 def _described(case: ValveCase) -> list[str]:
-    """A case as it was read, in lines."""
+    """A case in lines of text."""
     surface, tips = case.surface, case.frame(Role.REFERENCE).papillary_tips
     lines = [
         f"{len(surface.vertices)} vertices, {len(surface.triangles)} triangles, leaflets "

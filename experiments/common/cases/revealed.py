@@ -1,4 +1,4 @@
-"""Virtual patients with a truth: estimated, then grouped, counted, drawn and kept."""
+"""Virtual patients with a known truth: blind estimates, their verdicts and errors by group."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Judged: TypeAlias = tuple[EstimateRecord, str]
-"""An estimate, and the verdict that counts for it, in a word."""
+"""An estimate, and the verdict that counts for it."""
 
 Groups: TypeAlias = Mapping[str, Sequence[Judged]]
-"""Estimates by what tables call their scenario, data or filter."""
+"""Estimates by the name of their scenario, data or filter."""
 
 NOTHING = dict.fromkeys(("estimate", "std", "low", "high"))
 
@@ -41,7 +41,7 @@ def estimate_hidden(
 ) -> Result:
     """Estimate a case or volume in a process that cannot see its truth.
 
-    Where that left nothing the result has failed, and its moduli are as they were believed before.
+    If that process fails, the result has failed and has the priors of the moduli.
     """
     try:
         return blind.estimate_blindly(values, folder, case, sealed)
@@ -56,12 +56,12 @@ def estimate_hidden(
 
 
 def revealed(results: Results) -> list[tuple[Record, EstimateRecord]]:
-    """Record and estimate of each patient; runs that ended without either are left out."""
+    """Record and estimate of each patient that has both."""
     return [(one, one.estimates[0]) for one in results.records.values() if one.estimates]
 
 
 def grouped(estimates: Iterable[tuple[str, EstimateRecord, EstimateRecord]]) -> Groups:
-    """Groups from names, estimates, and the estimates whose verdicts count for them."""
+    """Groups from triples: name, estimate, and the estimate whose verdict counts for it."""
     groups: dict[str, list[Judged]] = {}
     for name, estimate, own in estimates:
         groups.setdefault(name, []).append((estimate, trust_of(own)))
@@ -77,11 +77,11 @@ def unknowns_of(
     ----------
     groups : mapping
     by_name : bool
-        Whether each group is divided into ``GROUP, UNKNOWN``.
+        Divide each group into ``GROUP, UNKNOWN``.
     nuisances : bool
-        Whether all other unknowns are included.
+        Include all other unknowns.
     stated : bool
-        Whether numbers are left out where the verdict is that there is no estimate.
+        Leave out numbers whose verdict is that there is no estimate.
     """
     found: dict[str, list[Unknown]] = {}
     for name, group in groups.items():
@@ -93,15 +93,9 @@ def unknowns_of(
 
 
 def verdicts_and_skill(by: str, groups: Groups, *, stated: bool = True) -> Table:
-    """How many estimates of each group have which verdict, and what their moduli are worth.
+    """Number of estimates by group and verdict, and the skill of their moduli.
 
-    Parameters
-    ----------
-    by : str
-        Name of the first column.
-    groups : mapping
-    stated : bool
-        See `unknowns_of`.
+    ``by`` names the first column; for ``stated`` see `unknowns_of`.
     """
     skill = skill_table(by, unknowns_of(groups, stated=stated))
     rows = []
@@ -112,7 +106,7 @@ def verdicts_and_skill(by: str, groups: Groups, *, stated: bool = True) -> Table
 
 
 def groups_figure(groups: Groups) -> Figure:
-    """Moduli over their truths, a band for each group (`mvest.reporting.skill.moduli_figure`)."""
+    """Moduli against their truths, a band for each group."""
     return moduli_figure(
         {
             name: [(own, trust) for estimate, trust in group for own in estimate.moduli]
@@ -122,7 +116,7 @@ def groups_figure(groups: Groups) -> Figure:
 
 
 def modulus_row(estimate: EstimateRecord, own: Unknown) -> dict[str, Any]:
-    """A modulus with its interval and verdict; the error also where no number may be stated."""
+    """A modulus with its interval and verdict, and its error even if no number may be stated."""
     error = own.relative_error
     return {
         "modulus": own.name,
@@ -146,7 +140,7 @@ MODULUS_COLUMNS: Mapping[str, Column] = {
 
 
 def short(record: Record, *, nuisances: bool = False, details: Sequence[str] = ()) -> Record:
-    """A record with what tables and figures of estimates need; the run's folder has all of it."""
+    """A record reduced to what tables and figures of estimates need."""
 
     def shortened(estimate: EstimateRecord) -> EstimateRecord:
         others = {name: shortened(other) for name, other in estimate.alternatives.items()}

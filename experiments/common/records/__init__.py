@@ -1,1 +1,1 @@
-"""What a study finds, as it is written down, and the tables and words that are made of it."""
+"""The record of a run, and the tables and pages made from it."""

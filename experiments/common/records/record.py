@@ -29,26 +29,22 @@ VERSION = 3
 """Of the layout of a record."""
 
 FIELDS = "fields.npz"
-"""What a run leaves of arrays beside its record."""
+"""File of a run's arrays, next to its record."""
 
 HASH_DIGITS = 12
 """Digits of a hash that a line of text shows."""
 
 NOT_GATED, PASSED_GATE, FAILED_GATE = "not gated", "passed", "NOT passed"
-"""The verdict of the gate on an anatomy begins with one of these."""
+"""A verdict of the gate on an anatomy begins with one of these."""
 
 Status = Literal["converged", "failed"]
 Number: TypeAlias = float | int | str | bool | None
 
 
 class GitState(Frozen):
-    """The commit that computed a record; None outside a checkout.
+    """The commit that computed a record, and whether tracked files differed from it.
 
-    Attributes
-    ----------
-    sha : str or None
-    dirty : bool or None
-        Whether tracked files differed from it.
+    Both are None outside a checkout.
     """
 
     sha: str | None
@@ -88,7 +84,7 @@ class Provenance(Frozen):
 
 
 class Mesh(Frozen):
-    """The estimator's mesh, and the truth's where there is another."""
+    """The estimator's mesh, and the truth's if it has another one."""
 
     sha256: str
     nodes: int
@@ -97,7 +93,7 @@ class Mesh(Frozen):
 
     @classmethod
     def of(cls, mesh: SolidMesh, truth: SolidMesh | None = None) -> Mesh:
-        """What a record says of a mesh, and of that of the truth."""
+        """The record of a mesh, and of the truth's mesh."""
         return cls(
             sha256=mesh.sha256,
             nodes=len(mesh.nodes),
@@ -107,7 +103,7 @@ class Mesh(Frozen):
 
 
 class Model(Frozen):
-    """What the estimator computed with, as far as its cost depends on it.
+    """The estimator's model, as far as its cost depends on it.
 
     Attributes
     ----------
@@ -133,33 +129,31 @@ def _plain(tables: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Result(Frozen):
-    """What a study returns. Everything that tables and figures show is in it.
+    """What a study returns: everything that its tables and figures show.
 
     Attributes
     ----------
     tables : mapping of str to Table
-        Tidy tables by name, stored as plain data (`table_of`); the one called ``""`` is the study's
-        main table.
+        Tidy tables by name, stored as plain data (see `table_of`); ``""`` is the main one.
     numbers : mapping
-        Single values by name, with the unit at the end of the name; MLflow gets those that are
-        numbers.
+        Single values; a name ends with its unit. MLflow gets the numeric ones.
     estimates : tuple of EstimateRecord
     arrays : mapping
-        Written beside the record, for figures; not part of it.
+        Stored next to the record, for figures; not part of it.
     status : {"converged", "failed"}
     reason, detail : str
         Why the run ended.
     mesh : Mesh or None
     forward_solves : int
     row : str
-        What tables call this run, where the data say it and not the configuration.
+        What tables call this run; empty: the configuration's ``row``.
     parameters : tuple of str
-        Likewise.
+        Empty: those of the configuration.
     model : Model or None
-        Likewise.
+        None: that of the configuration.
     gate : str or None
-        Verdict of the gate on the anatomy (see `experiments.common.building.gate`); None where the
-        study uses no configured anatomy.
+        Verdict of the gate on the anatomy (see `experiments.common.building.gate`); None for a
+        study without a configured anatomy.
     """
 
     tables: Annotated[Mapping[str, Any], BeforeValidator(_plain)] = {}
@@ -182,13 +176,7 @@ class Result(Frozen):
         return type(self)(**{**known, **values})
 
     def table_of(self, name: str = "") -> Table:
-        """One of its tables.
-
-        Raises
-        ------
-        KeyError
-            If it has none of this name.
-        """
+        """One of its tables; raises a `KeyError` if it has none of this name."""
         return Table.of_plain(self.tables[name], f"table {name!r}")
 
     @property
@@ -205,7 +193,7 @@ class Record(Result):
     version : int
         Of this layout.
     study, experiment, title, table : str
-        Its study, its configuration, and what tables call it.
+        Kind of study, name of the configuration, and title and file name of its table.
     factors : mapping
         What is varied in this job of a sweep, by name.
     seconds_total : float
@@ -256,7 +244,7 @@ def has_passed(gate: str) -> bool | None:
 
 
 def model_of_values(values: Mapping[str, Any]) -> Model:
-    """What a configuration says of the estimator's model."""
+    """The estimator's model that a configuration describes."""
     return Model(
         element=values["mechanics"]["element"],
         cells=tuple(values["mesh"][key] for key in ("columns", "rows", "layers")),
@@ -267,21 +255,15 @@ def model_of_values(values: Mapping[str, Any]) -> Model:
 
 
 def stamp(values: Mapping[str, Any], config_hash: str, result: Result, started: float) -> Record:
-    """The record of what a study returned.
+    """The record of what a study returned for a resolved configuration.
 
-    Parameters
-    ----------
-    values : mapping
-        The resolved configuration.
-    config_hash : str
-    result : Result
-    started : float
-        Seconds since the epoch.
+    The job ``started`` so many seconds after the epoch.
     """
     found = {name: getattr(result, name) for name in Result.model_fields if name != "arrays"}
     found["row"] = result.row or values["row"]
     found["parameters"] = result.parameters or tuple(values["parameters"])
     found["model"] = result.model or model_of_values(values)
+    mesh_hash = "none" if result.mesh is None else result.mesh.sha256
     return Record(
         **found,
         version=VERSION,
@@ -291,46 +273,34 @@ def stamp(values: Mapping[str, Any], config_hash: str, result: Result, started: 
         table=values["table"],
         factors=values["factors"],
         seconds_total=time.time() - started,
-        provenance=here_and_now(
-            config_hash, "none" if result.mesh is None else result.mesh.sha256, values["seed"]
-        ),
+        provenance=here_and_now(config_hash, mesh_hash, values["seed"]),
     )
+
+
+_source = cache(provenance)  # read once: a later checkout does not change what was imported
 
 
 def here_and_now(config_hash: str, mesh_hash: str, seed: int) -> Provenance:
-    """The provenance of what is written by this process."""
-    source = _source()
+    """The provenance of what this process writes now."""
+    finished = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     return Provenance(
-        **source,
-        config_hash=config_hash,
-        mesh_hash=mesh_hash,
-        seed=seed,
-        finished=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        **_source(), config_hash=config_hash, mesh_hash=mesh_hash, seed=seed, finished=finished
     )
-
-
-@cache
-def _source() -> dict[str, Any]:
-    """Asked for once: a process computes by what it has imported, whatever is checked out since."""
-    return provenance()
 
 
 ARRAYS = "arrays_sha256"
 """In a record's file, the digest of its arrays."""
 
 NEW_FIELDS = f"{PREFIX}{FIELDS}"
-"""Arrays that belong to the next record."""
+"""Arrays of a record that is about to be written."""
 
 
 def write_record(path: Path, record: Record, arrays: Mapping[str, Any] | None = None) -> None:
-    """Write a record as JSON, and its arrays beside it, with digests of both.
+    """Write a record as JSON and its arrays next to it, with digests of both.
 
-    A former record and its arrays are replaced only when their successors are on disk.
+    A former record and its arrays are replaced only when the new ones are on disk.
 
-    Raises
-    ------
-    InputError
-        If they cannot be written; the former ones are then still there.
+    Raises an `InputError` if they cannot be written; the former ones are then still there.
     """
     new = path.with_name(NEW_FIELDS)
     new.unlink(missing_ok=True)
@@ -341,7 +311,7 @@ def write_record(path: Path, record: Record, arrays: Mapping[str, Any] | None = 
 
 
 def adopt_arrays(path: Path) -> None:
-    """Give the arrays that a record was written with their name, also after a kill."""
+    """Rename the new arrays of a record to `FIELDS`; also repairs a write that was killed."""
     new, fields = path.with_name(NEW_FIELDS), path.with_name(FIELDS)
     with suppress(InputError, KeyError):
         digest = read_mapping(path)[ARRAYS]
@@ -352,13 +322,13 @@ def adopt_arrays(path: Path) -> None:
 
 
 def sealed_record(record: Record, arrays: Path) -> dict[str, Any]:
-    """Plain data of a record with digests of itself and of its file of arrays, if it has one."""
+    """Plain data of a record with digests of itself and of its file of arrays, if any."""
     digest = sha256_of(arrays) if arrays.is_file() else None
     return sealed({ARRAYS: digest, **record.model_dump(mode="json")})
 
 
 def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None) -> Record:
-    """A record from plain data, which must be as they were written.
+    """A record from plain data, which must be unchanged since they were written.
 
     Parameters
     ----------
@@ -366,12 +336,12 @@ def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None)
     where : str
         Names the data in an error.
     arrays : Path, optional
-        Where the file of its arrays lies, if it has one; not checked if not given.
+        The file of its arrays, if it has one; None: do not check it.
 
     Raises
     ------
     InputError
-        If the data are no record of this version, or they or the arrays were changed since.
+        If the data are no record of this version, or they or the arrays were changed.
     """
     known = {key: value for key, value in data.items() if key not in ("sha256", ARRAYS)}
     if known.get("version") != VERSION:
@@ -379,7 +349,7 @@ def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None)
     record = validated(Record, known, where)
     require_sealed(data, where)
     if arrays is not None and data.get(ARRAYS) != (sha256_of(arrays) if arrays.is_file() else None):
-        raise InputError(f"{where}: the arrays beside it are not those that it was written with")
+        raise InputError(f"{where}: its file of arrays is not the one it was written with")
     return record
 
 
@@ -389,6 +359,6 @@ def read_record(path: Path) -> Record:
     Raises
     ------
     InputError
-        If it cannot be read, is no such record, or is not as it was written.
+        If it cannot be read, is no such record, or was changed since it was written.
     """
     return record_from(read_mapping(path), str(path), path.with_name(FIELDS))

@@ -1,8 +1,8 @@
 """Tables, figures and page of any study, from its records alone.
 
-Of a table of results called NAME there are, in one folder: ``NAME.csv`` and ``NAME_PART.csv`` (tidy
-tables, for programs), ``NAME.md`` (the page: what readers see of the tables), ``NAME.png`` and
-``NAME_PART.png`` (figures, which the page shows), and, of the paper's own tables, LaTeX and PDF.
+A table of results called NAME consists of ``NAME.csv`` and ``NAME_PART.csv`` (tidy tables, for
+programs), ``NAME.md`` (the page for readers), ``NAME.png`` and ``NAME_PART.png`` (figures), and,
+for the paper's own tables, LaTeX and PDF.
 """
 
 from __future__ import annotations
@@ -21,23 +21,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LONGEST = 60
-"""Rows of a table that a page shows; a longer one is named as a file."""
+"""Most rows of a table on a page; of a longer one the page names the file."""
 
 
 def write_results(folder: Path, study: Study[Any], results: Results) -> list[Path]:
     """Write everything that follows from records; returns the paths, tables first.
 
-    Parameters
-    ----------
-    folder : Path
-        Existing folder. Files are called as the table that the records belong to.
-    study : Study
-    results : Results
+    ``folder`` exists. Files have the name of the table that the records belong to.
 
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
+    Raises an `InputError` if a file cannot be written.
     """
     drawn = None if study.figure is None or results.is_empty else study.figure(results)
     figures = drawn if isinstance(drawn, Mapping) else {"": drawn} if drawn else {}
@@ -64,7 +56,7 @@ def write_page(
     captions: Mapping[str, str],
     latex: Collection[str],
 ) -> list[Path]:
-    """Write tables as CSV, figures, and the page that shows these and figures of earlier.
+    """Write tables as CSV, figures, and the page that shows these and earlier figures.
 
     Parameters
     ----------
@@ -74,14 +66,14 @@ def write_page(
     tables : mapping of str to Table
         Part -> table; ``""`` is the main one.
     summary : mapping of str to Table or None
-        What readers see in place of `tables`; of the same name it replaces one.
+        Tables that readers see in place of `tables`.
     records : sequence of Record
         Those that the tables follow from.
     figures : mapping of str to Figure
     captions : mapping of str to str
         Part -> caption of its figure.
     latex : collection of str
-        Names of readers' tables that are written as LaTeX, too, and of figures as PDF.
+        Names of readers' tables that are also written as LaTeX, and of figures as PDF.
 
     Raises
     ------
@@ -96,8 +88,8 @@ def write_page(
         from mvest.reporting.figures import save_figure_with
 
         place = _named(base, part)
-        line = provenance_of(records)
-        drawn += save_figure_with(place, figure, line, pdf=place.name in latex)
+        pdf = place.name in latex
+        drawn += save_figure_with(place, figure, provenance_of(records), pdf=pdf)
     for part, table in {**tables, **shown}.items():
         path = _named(base, part, ".csv")
         written.append(write_atomically(path, comments + table.csv()))
@@ -121,7 +113,7 @@ def write_page(
 
 
 def words_of(study: Study[Any], record: Record) -> str:
-    """What a finished run says on the terminal: its cautions, numbers and readers' tables."""
+    """The text of a finished run for the terminal: cautions, numbers and readers' tables."""
     parts = cautions([record])
     results = Results({record.experiment: record})
     if study.words is not None and not results.is_empty:
@@ -137,14 +129,14 @@ def words_of(study: Study[Any], record: Record) -> str:
 
 
 def numbers_of(record: Record) -> list[str]:
-    """The single values of a record, a line of Markdown each; why a failed run has none."""
+    """The single values of a record, a line of Markdown each, or why a run failed."""
     failed = [] if record.converged else [f"* no result: {record.reason}"]
     values = {name: f"{v:.4g}" if isinstance(v, float) else v for name, v in record.numbers.items()}
     return failed + [f"* {_heading(name)}: {value}" for name, value in values.items()]
 
 
 def cautions(records: Sequence[Record]) -> list[str]:
-    """What stands before results whose anatomies have not passed the gate, naming them."""
+    """Warnings about results whose anatomies have not passed the gate, with their names."""
     rows: dict[str, list[str]] = {}
     for record in records:
         if record.caution:
@@ -156,7 +148,7 @@ def cautions(records: Sequence[Record]) -> list[str]:
 
 
 def provenance_of(records: Sequence[Record]) -> str:
-    """Where the first of several records came from, and how many there are besides."""
+    """The provenance of the first of several records, and the number of others."""
     lines = sorted({record.line for record in records})
     return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")
 

@@ -418,5 +418,5 @@ STUDY = Study(
     keep=keep,
     keep_arrays=keep_arrays,
     keeps_failures=True,
-    checks=lambda: (check_patient,),
+    check=check_patient,
 )

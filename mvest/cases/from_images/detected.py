@@ -144,9 +144,8 @@ class DetectedValve:
     ) -> dict[str, tuple[Mapping[str, Any], ...]]:
         """Details for a record (`mvest.personalisation.record`).
 
-        ``image_step`` has one row about volume, frames, model and the report's files,
-        ``image_frames`` the measures of each frame, ``pictures`` the ``file`` and ``caption`` of
-        each.
+        One row about volume, frames, model and the report's files, one for the measures of each
+        frame, and one for ``file`` and ``caption`` of each picture.
         """
         volume, frames = self.volume, self.frames
         about = {

@@ -39,28 +39,22 @@ class EnsembleFilter(Filter):
 
         x̄⁺ = x̄ + K d̄,   A⁺ = A (I + Sᵀ S / α)^(−1/2)
 
-    One step with α = 1 is the ensemble Kalman filter. k steps with α = k each are the ensemble
-    smoother with multiple data assimilation (Emerick and Reynolds 2013, Comput. Geosci. 55:3): each
-    step uses a k-th of the observation's information, Σ 1/α = 1, and linearises the model at the
-    current ensemble.
+    One step with α = 1 is the ensemble Kalman filter. k steps with α = k are the ensemble smoother
+    with multiple data assimilation (Emerick and Reynolds 2013, Comput. Geosci. 55:3): each uses a
+    k-th of the observation's information and linearises the model at the current ensemble.
 
     Members are drawn with exactly the prior's mean and covariance (second-order exact sampling,
     Pham 2001, Mon. Weather Rev. 129:1194). For a linear model and N > p the square root is then
-    exactly the Kalman filter, in any number of steps; the perturbed form has its mean in one step,
-    and its covariance up to the error of N draws. Members whose model fails are left out.
-
-    The covariance of an iterate is that of the ensemble.
+    exactly the Kalman filter; the perturbed form has its mean in one step, and its covariance up to
+    the error of N draws. Members whose model fails are left out.
 
     Attributes
     ----------
-    members : int
-        N.
-    steps : int
-        1: filter; more: smoother.
+    members, steps : int
+        N and k.
     kind : str
         ``square_root`` or ``perturbed``.
     seed : int
-        Of all random numbers.
     """
 
     members: int = 30

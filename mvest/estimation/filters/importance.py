@@ -66,16 +66,13 @@ class ImportanceFilter(Filter):
 
     Attributes
     ----------
-    runs : int
-        Largest number of runs of the model, those of `start` not counted.
-    batch : int
-        Runs of each round.
+    runs, batch : int
+        Largest number of runs of the model, without those of `start`, and runs of each round.
     effective : float
         Sufficient number of effective draws.
     start : Filter
         Finds x₀ and P₀.
     seed : int
-        Of all random numbers.
     """
 
     runs: int = 320
@@ -133,15 +130,9 @@ class ImportanceFilter(Filter):
 
 
 class _Draws:
-    """Draws of all rounds, with the mixtures that they come from.
+    """Draws ``points (s, p)`` of all rounds, with their mixtures (shares, means and covariances).
 
-    Attributes
-    ----------
-    points : (s, p)
-    rounds : list of (int, list)
-        Number of draws, and their mixture (shares, means and covariances).
-    slope : (n, p)
-        dh/dx at the last run with derivatives; 0 without any.
+    ``slope (n, p)`` is dh/dx at the last run with derivatives; 0 without any.
     """
 
     def __init__(self, run: FilterRun, laplace: Gaussian) -> None:
@@ -252,10 +243,7 @@ class _Draws:
 
     def _log_mixture(self, mixture: list[tuple[float, FloatArray, FloatArray]]) -> FloatArray:
         total = sum(share for share, _, _ in mixture)
-        parts = [
-            np.log(share / total) + _log_normal(self.points, mean, covariance)
-            for share, mean, covariance in mixture
-        ]
+        parts = [np.log(share / total) + _log_normal(self.points, *of) for share, *of in mixture]
         return np.asarray(logsumexp(parts, axis=0))
 
 

@@ -192,7 +192,10 @@ class IteratedFilter(Filter):
                         update = kalman_update(run.unit, innovation, point.H, run.noise)
                         P = L @ covariance @ L.T
                         run.record(point.z, P, point.objective, update.log_likelihood)
-                        more["curvature"] = _left_out(run, point, covariance)
+                        # In filter coordinates, what Gauss-Newton leaves out of the Hessian.
+                        A, back = run.noise.whiten(point.H), np.linalg.pinv(L)
+                        left = np.linalg.inv(covariance) - np.eye(len(A.T)) - A.T @ A
+                        more["curvature"] = np.asarray(back.T @ left @ back)
                         reason = Reason.CONVERGED
                         detail = f"{iterations} iterations, then with second derivatives"
                 return run.finish(reason, detail, point.prediction, innovation, update, **more)
@@ -238,8 +241,8 @@ def _search(
             if gain >= POOR_DECREASE:
                 return trial, damping, None
             if gain >= SUFFICIENT_DECREASE:
-                return trial, _more(damping), None
-        damping = _more(damping)
+                return trial, max(FIRST_DAMPING, DAMPING_FACTOR * damping), None
+        damping = max(FIRST_DAMPING, DAMPING_FACTOR * damping)
     return None, damping, failure
 
 
@@ -291,13 +294,6 @@ def _with_second_derivatives(
     return None
 
 
-def _left_out(run: FilterRun, point: "_Point", covariance: FloatArray) -> FloatArray:
-    """The part of the Hessian that Gauss-Newton leaves out, in filter coordinates (p, p)."""
-    A, back = run.noise.whiten(point.H), np.linalg.pinv(run.L)
-    left = np.linalg.inv(covariance) - np.eye(len(point.x)) - A.T @ A
-    return np.asarray(back.T @ left @ back)
-
-
 def _lower(run: FilterRun, point: "_Point", step: FloatArray, slope: FloatArray) -> "_Point | None":
     """The first point along halved steps at which J is sufficiently lower."""
     for _ in range(MAX_HALVINGS):
@@ -308,11 +304,6 @@ def _lower(run: FilterRun, point: "_Point", step: FloatArray, slope: FloatArray)
                 return trial
         step = 0.5 * step
     return None
-
-
-def _more(damping: float) -> float:
-    """The damping after a step that was rejected or poor."""
-    return max(FIRST_DAMPING, DAMPING_FACTOR * damping)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,10 +1,10 @@
 """Which observation would determine a parameter, from the Jacobians of one run of the model.
 
-Information adds up over independent observations and grows with the inverse square of the noise, so
+Information of independent observations adds up and grows with the inverse square of the noise, so
 that designs of any size are compared without running the model again. Each is a p × p triangle T
 with Tᵀ T = (W H D)ᵀ (W H D) for noise of unit standard deviation, D = diag(values)
 (Kay, Fundamentals of Statistical Signal Processing I, 1993, sections 3.7 and 3.8). All standard
-deviations are relative: those of the logarithm of a positive parameter, to first order.
+deviations are relative.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mvest.estimation.prediction import require_positive
 from mvest.typing import FloatArray
 
 NOISE_RANGE = (1e-6, 1e6)
-"""Times the unit of the observation, between which a needed noise is looked for."""
+"""Range of a needed noise, in units of the observation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,20 +51,10 @@ class Design:
         return cls(tuple(names), values, _triangle(observation_noise(R, len(H)).whiten(H) * values))
 
     def at(self, noise: float, knowledge: Mapping[str, float] | None = None) -> Identifiability:
-        """What is known with noise of a standard deviation.
+        """Identifiability with noise of a standard deviation, in units of the observation.
 
-        Parameters
-        ----------
-        noise : float
-            In units of the observation.
-        knowledge : mapping, optional
-            Prior relative standard deviations: 0 of known parameters, which are left out, and
-            infinite of those not named.
-
-        Raises
-        ------
-        InputError
-            If the noise or the knowledge is not admissible.
+        ``knowledge`` are prior relative standard deviations: 0 for known parameters, which are left
+        out, and infinite if not named. InputError if noise or knowledge are not admissible.
         """
         knowledge = dict(knowledge or {})
         strange = sorted(set(knowledge) - set(self.names))
@@ -100,7 +90,7 @@ class Design:
 
 
 def needed(relative: Callable[[float], float], within: tuple[float, float]) -> float:
-    """Where an increasing function is 1; 0 if it is above 1 on the range, infinite if below."""
+    """Argument at which an increasing function is 1; 0 if it is above 1, infinite if below."""
 
     def excess(log: float) -> float:
         # The logarithm is nearly linear; infinite values stay comparable.

@@ -1,4 +1,4 @@
-"""Which parameters the data distinguish, from the Jacobian alone; the effect of a model error."""
+"""Which parameters the data distinguish, from the Jacobian; shift by an error of the model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,11 +18,11 @@ from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
 STEP = 0.1
-"""Change of the first parameter of a trade-off, in parts of its scale."""
+"""Change of the first parameter of a trade-off, relative to its scale."""
 RELEVANT_SHARE = 0.1
-"""Smallest share of a parameter in a combination that is named."""
+"""Smallest share in a combination for a parameter to be named."""
 UNDETERMINED = ("not determined at all", "known to no better than its own size")
-"""Words for combinations without a standard deviation, and with one as large as their scales."""
+"""Words for combinations with an infinite standard deviation, and with one of their scales."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +34,10 @@ class TradeOff:
     parameters : tuple of str, (q,)
         The first is most correlated with the others.
     changes : tuple of float, (q,)
-        Changes in their units that hardly show together: the first changes by `STEP` of its scale,
-        the others by cov(i, first) / var(first) of that.
+        Changes in their units that hardly affect the data together: the first by `STEP` of its
+        scale, the others by cov(i, first) / var(first) of that.
     relative : tuple of float, (q,)
-        The same in parts of their scales.
+        The same relative to their scales.
     correlation : float
         Smallest absolute correlation of the first with one of the others, at the bound.
     """
@@ -50,7 +50,7 @@ class TradeOff:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identifiability:
-    """Fisher information of p parameters in units of their scales, and what follows from it.
+    """Fisher information of p parameters in units of their scales.
 
     Attributes
     ----------
@@ -58,11 +58,11 @@ class Identifiability:
     scale : (p,) in units of each parameter
         A large change of each parameter; eigenvectors depend on it.
     information : (p, p)
-        Scaled Fisher information D Hᵀ R⁻¹ H D, D = diag(scale), plus D P⁻¹ D of a prior if given.
+        D Hᵀ R⁻¹ H D, D = diag(scale), plus D P⁻¹ D of a prior if given.
     eigenvalues : (p,), ascending
-        A combination with eigenvalue λ has the standard deviation 1/√λ, in parts of the scales.
+        A combination with eigenvalue λ has the standard deviation 1/√λ, relative to the scales.
     eigenvectors : (p, p)
-        Column i belongs to eigenvalue i; the first is the least known combination.
+        In columns; the first is the least known combination.
     covariance : (p, p) in products of the parameters' units
         Cramér-Rao bound: no unbiased estimator has a smaller covariance. Infinite (and NaN off the
         diagonal) for parameters that the data leave undetermined.
@@ -96,26 +96,29 @@ class Identifiability:
         return result
 
     def flat(self, limit: float = 0.5) -> tuple[str, ...]:
-        """Combinations whose standard deviation exceeds `limit` parts of the scales, in words."""
+        """Combinations with a standard deviation above `limit` of the scales, in words."""
         with np.errstate(divide="ignore"):
             widths = 1.0 / np.sqrt(self.eigenvalues)
-        return tuple(
-            f"{_combination(self.names, self.eigenvectors[:, i])}: "
-            + (
-                f"known to ±{100 * width:.3g} %"
-                if width < 1.0
-                else UNDETERMINED[int(width < np.inf)]
-            )
-            for i, width in enumerate(widths)
-            if width > limit
-        )
+        words = []
+        for vector, width in zip(self.eigenvectors.T, widths, strict=True):
+            if width > limit:
+                # The largest share first, and positive.
+                order = np.argsort(-np.abs(vector))
+                own = vector * np.sign(vector[order[0]])
+                named = [i for i in order if abs(own[i]) >= RELEVANT_SHARE]
+                terms = " ".join(f"{own[i]:+.2f} {self.names[i]}" for i in named).removeprefix("+")
+                known = f"known to ±{100 * width:.3g} %"
+                words.append(
+                    f"{terms}: {known if width < 1 else UNDETERMINED[int(width < np.inf)]}"
+                )
+        return tuple(words)
 
     def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[TradeOff, ...]:
         """Groups of parameters that the data hardly distinguish, the largest group first.
 
-        Two belong to one group if their absolute correlation at the bound is at least `limit` and
-        both are known no better than to `width` parts of their scales. Undetermined parameters have
-        no correlation; see `flat`.
+        Two are grouped if their absolute correlation at the bound is at least `limit` and both have
+        standard deviations of at least `width` of their scales. Undetermined parameters have no
+        correlation; see `flat`.
         """
         uncertain = self.std / self.scale >= width
         size = np.where(np.outer(uncertain, uncertain), np.abs(self.correlation), 0.0)
@@ -154,15 +157,15 @@ def identifiability(
     """Cramér-Rao bound and flat directions of an observation with Jacobian H and noise R.
 
     With W H D = U diag(s) Vᵀ, Wᵀ W = R⁻¹, D = diag(scale), the scaled Fisher information is
-    V diag(s²) Vᵀ and the bound D V diag(s⁻²) Vᵀ D. A prior is one more observation of the
-    parameters (Van Trees' bound, to first order).
+    V diag(s²) Vᵀ and the bound D V diag(s⁻²) Vᵀ D. A prior is one more observation (Van Trees'
+    bound, to first order).
 
     Parameters
     ----------
     H : (n, p) in units of the observation per unit of each parameter
     R : NoiseCovariance, in squared units of the observation
     scale : (p,) in units of each parameter
-        Positive; with the parameters' own size every statement is relative.
+        Positive; with the parameters' values, results are relative.
     prior : Gaussian, optional
         Positive definite.
     names : p names, optional
@@ -194,28 +197,10 @@ def identifiability(
             raise InputError(
                 "the prior's covariance must be positive definite here; leave fixed parameters out"
             ) from error
-    s, V = _singular(rows)
-
-    return Identifiability(
-        names=names,
-        scale=D,
-        information=(V * s**2) @ V.T,
-        eigenvalues=s**2,
-        eigenvectors=V,
-        covariance=_bound(D, s, V),
-    )
-
-
-def _singular(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Singular values ``(p,)`` of ``rows (n, p)``, the smallest first, and right vectors (p, p)."""
-    p = rows.shape[1]
     _, s, Vt = np.linalg.svd(rows, full_matrices=len(rows) < p)
     s = np.concatenate([s, np.zeros(p - s.size)])
     s[s <= s[0] * np.finfo(np.float64).eps * max(rows.shape)] = 0.0
-    return s[::-1], Vt[::-1].T
-
-
-def _bound(D: FloatArray, s: FloatArray, V: FloatArray) -> FloatArray:
+    s, V = s[::-1], Vt[::-1].T
     known = s > 0.0
     X = D[:, None] * V[:, known] / s[known]
     covariance = X @ X.T
@@ -224,15 +209,7 @@ def _bound(D: FloatArray, s: FloatArray, V: FloatArray) -> FloatArray:
     covariance[lost, :] = np.nan
     covariance[:, lost] = np.nan
     covariance[lost, lost] = np.inf
-    return covariance
-
-
-def _combination(names: Sequence[str], vector: FloatArray) -> str:
-    """An eigenvector in words, the largest share first and positive."""
-    order = np.argsort(-np.abs(vector))
-    vector = vector * np.sign(vector[order[0]])
-    terms = [f"{vector[i]:+.2f} {names[i]}" for i in order if abs(vector[i]) >= RELEVANT_SHARE]
-    return " ".join(terms).removeprefix("+")
+    return Identifiability(names, D, (V * s**2) @ V.T, s**2, V, covariance)
 
 
 def shift_by_model_error(found: Estimate, R: NoiseCovariance, offset: FloatArray) -> FloatArray:
@@ -243,8 +220,8 @@ def shift_by_model_error(found: Estimate, R: NoiseCovariance, offset: FloatArray
 
         b = (Hᵀ R⁻¹ H + P⁻¹)⁻¹ Hᵀ R⁻¹ offset
 
-    the update of Gauss-Newton with the offset as innovation, with the prior's P and the Jacobian H
-    at the estimate. The offset of a mesh is the prediction of a finer one less its own.
+    with the prior's P and the Jacobian H at the estimate. The offset of a mesh is the prediction of
+    a finer one less its own.
     """
     assert found.prediction is not None
     noise, prior = observation_noise(R, len(offset)), to_filter(found.transform, found.prior)
@@ -255,8 +232,7 @@ def shift_by_model_error(found: Estimate, R: NoiseCovariance, offset: FloatArray
 def with_shift(found: Estimate, shift: FloatArray) -> Estimate:
     """The estimate with diag(b²) added to its covariance, for a shift b (p,) by a model error.
 
-    The size of b measures the model error; its direction does not: with b bᵀ the covariance across
-    b would stay as it is.
+    Only the size of b is known, not its direction: b bᵀ would leave the covariance across b as is.
     """
     covariances = found.transformed_iterate_covariances.copy()
     covariances[-1] += np.diag(shift**2)

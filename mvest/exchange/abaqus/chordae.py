@@ -1,20 +1,18 @@
 """The chord network of a detailed model as straight cables.
 
-Detailed valve models hold chordae as a graph: a trunk leaves a papillary anchor, splits, and fans
-out into many insertions. The mechanics here knows one straight tension-only cable per (anchor,
-insertion). Two quantities carry over exactly and one is shared out:
+Detailed models hold chordae as a graph: a trunk leaves a papillary anchor, splits, and fans out
+into many insertions. The mechanics here has one straight tension-only cable per pair of anchor and
+insertion. Each cable has
 
-* the **rest length** is the length of the shortest path along the network, so that a cable tightens
-  exactly when its path is drawn straight;
-* the **insertion** is the network's end on the leaflet;
-* the **axial stiffness** shares each trunk among the insertions beyond it. If the insertions of one
-  anchor pull equally hard, the force in network edge ``e`` is ``n_e`` times that at an insertion,
-  where ``n_e`` counts the insertions whose path contains ``e``. Insertion ``j`` then gives by
-  ``sum_e n_e l_e / EA`` per unit force, and a cable of rest length ``L_j`` that gives as much has
-  the stiffness ``EA L_j / sum_e n_e l_e``.
+* the **rest length** of the shortest path along the network, so that it tightens exactly when the
+  path is straight;
+* the **insertion** where the path meets the leaflet;
+* a share of the **axial stiffness** of the trunk. If all insertions of an anchor pull equally, the
+  force in edge ``e`` is ``n_e`` times that at an insertion, where ``n_e`` counts the paths through
+  ``e``. Insertion ``j`` then yields by ``sum_e n_e l_e / EA`` per unit force, as does a cable of
+  rest length ``L_j`` and stiffness ``EA L_j / sum_e n_e l_e``.
 
-What is lost: a trunk can only point in one direction, so branches of one trunk restrain each other
-sideways; straight cables do not.
+Lost is that branches of one trunk restrain each other sideways.
 """
 
 from __future__ import annotations
@@ -29,9 +27,9 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
 TOE_STRAIN = 0.01
-"""Where the secant stiffness of chordae is taken, up to which it rises.
+"""Strain of the secant stiffness of chordae.
 
-Chordae act as strings that hardly lengthen; the far higher stiffness of exponential ones at several
+Chordae act as strings that hardly lengthen. The far higher stiffness of exponential ones at several
 percent would describe a state that no recorded closure reaches.
 """
 
@@ -43,34 +41,34 @@ def trace_cables(
 
     Parameters
     ----------
-    nodes : ndarray
-        ``(n, 3)`` mm.
-    edges : ndarray
-        ``(k, 2)`` chord segments between nodes.
+    nodes : (n, 3) ndarray
+        mm.
+    edges : (k, 2) ndarray
+        Chord segments between nodes.
     anchors : ndarray
-        Nodes fixed in the papillary muscles.
+        Nodes in the papillary muscles.
     leaflet : ndarray
-        Nodes of the leaflets. A path ends at the first one it meets.
+        Nodes of the leaflets. A path ends at the first one.
 
     Returns
     -------
-    anchor, insertion : ndarray
-        ``(c,)`` nodes at the ends of each straight cable.
-    length : ndarray
-        ``(c,)`` mm along the network.
-    share : ndarray
-        ``(c,)`` in (0, 1]: axial stiffness of the cable over that of the chord material.
+    anchor, insertion : (c,) ndarray
+        Nodes at the ends of each cable.
+    length : (c,) ndarray
+        mm along the network.
+    share : (c,) ndarray
+        Axial stiffness of the cable over that of the chord material, in (0, 1].
 
     Raises
     ------
     InputError, GeometryError
-        If a segment has no length or reaches no anchor, or an anchor reaches no leaflet.
+        A segment has no length or reaches no anchor, or an anchor reaches no leaflet.
     """
     length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     if np.any(length <= 0):
         raise InputError(f"chord segment {int(np.argmin(length))} has no length")
     on_leaflet = np.isin(np.arange(len(nodes)), leaflet)
-    # Edges out of leaflet nodes are left out: two chords that insert at one node do not continue.
+    # No edges out of leaflet nodes: two chords that insert at one node do not continue.
     both = np.vstack([edges, edges[:, ::-1]])
     outward = ~on_leaflet[both[:, 0]]
     graph = sp.csr_matrix(
@@ -90,28 +88,22 @@ def trace_cables(
         alone = int(anchors[np.argmin(reachable.any(axis=1))])
         raise GeometryError(f"chord anchor at node {alone} reaches no leaflet")
     anchor_index, end_index = np.nonzero(reachable)
-    shares = [
-        _stiffness_shares(distance[i], predecessor[i], ends[reachable[i]])
-        for i in range(len(anchors))
-    ]
+    shares = []
+    for far, back, there in zip(distance, predecessor, reachable, strict=True):
+        own = ends[there].tolist()
+        paths = []  # without the anchor; a node stands for the segment that leads to it
+        for end in own:
+            path = [end]
+            while back[path[-1]] >= 0:
+                path.append(int(back[path[-1]]))
+            paths.append(path[:-1])
+        users = Counter(node for path in paths for node in path)
+        shares += [
+            far[end] / sum(users[node] * (far[node] - far[back[node]]) for node in path)
+            for end, path in zip(own, paths, strict=True)
+        ]
     reach = distance[anchor_index, ends[end_index]]
-    return anchors[anchor_index], ends[end_index], reach, np.concatenate(shares)
-
-
-def _stiffness_shares(distance: FloatArray, predecessor: IntArray, ends: IntArray) -> FloatArray:
-    """``L_j / sum_e n_e l_e`` for the insertions of one anchor."""
-    paths = []
-    for end in ends.tolist():
-        path = [end]
-        while predecessor[path[-1]] >= 0:
-            path.append(int(predecessor[path[-1]]))
-        paths.append(path[:-1])  # without the anchor; a node names the segment that leads to it
-    users = Counter(node for path in paths for node in path)
-    give = [
-        sum(users[node] * (distance[node] - distance[predecessor[node]]) for node in path)
-        for path in paths
-    ]
-    return np.asarray(distance[ends] / np.array(give))
+    return anchors[anchor_index], ends[end_index], reach, np.array(shares)
 
 
 def truss_stiffness(area: float, ogden: FloatArray, strain: float = TOE_STRAIN) -> float:
@@ -124,14 +116,14 @@ def truss_stiffness(area: float, ogden: FloatArray, strain: float = TOE_STRAIN) 
     ----------
     area : float
         mm^2.
-    ogden : ndarray
-        ``(t, 2)`` mu (MPa) and alpha of each term.
+    ogden : (t, 2) ndarray
+        mu (MPa) and alpha of each term.
     strain : float
 
     Raises
     ------
     InputError
-        If area or stress is not positive.
+        The area or the stress is not positive.
     """
     mu, alpha = ogden.T
     stretch = 1 + strain

@@ -1,15 +1,13 @@
-"""Reading an Abaqus input deck (``.inp``) in the form of Texas TriValve: one instance, one step.
+"""Abaqus input decks (``.inp``) in the form of Texas TriValve: one instance, one step.
 
-The deck states nodes, shells (``S4R``, ``S3``) and trusses (``T3D2``), sets of both, sections,
-Ogden materials of the trusses, amplitudes, and a step with its duration, constrained nodes and
-pressure. A deck that makes nodes or elements otherwise (``*NGEN``, ``*ELCOPY``, ...), has several
-or moved instances, or keeps data in other files (``*INCLUDE``, ``INPUT=``) is refused. All other
-keywords are passed over.
+Read are nodes, shells (``S4R``, ``S3``) and trusses (``T3D2``), their sets and sections, Ogden
+materials, amplitudes, and the step with its duration, constrained nodes and pressure. A deck that
+generates nodes or elements, has a moved instance, or includes other files is refused. Other
+keywords are ignored.
 
-Format: *Abaqus Keywords Reference Guide*, and *Analysis User's Guide*, "Input syntax rules": a
-keyword line begins with one star, a comment with two; words are separated by commas, options are
-``NAME=VALUE``; case does not matter. Names may be preceded by that of their instance, which is
-left out here.
+Format: *Abaqus Keywords Reference Guide*, and *Analysis User's Guide*, "Input syntax rules". A
+keyword line begins with one star, a comment with two; options are ``NAME=VALUE``; case does not
+matter. The instance in front of a name is ignored.
 """
 
 from __future__ import annotations
@@ -18,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,12 +25,11 @@ from mvest.reading.text import MAX_NUMBER, one_line, read_bytes
 from mvest.typing import FloatArray, IntArray
 
 CORNERS = {"S4R": 4, "S3": 3, "T3D2": 2}
-"""Nodes of the elements that are read: shells, and trusses."""
+"""Nodes of the elements that are read."""
 _REFUSED = {
     *("INCLUDE", "NGEN", "NCOPY", "NFILL", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "TRANSFORM"),
     *("SUBMODEL", "IMPORT", "RESTART", "MAP SOLUTION", "DLOAD", "STATIC"),
 }
-WHAT = {"NSET": "node", "ELSET": "element"}
 
 
 @dataclass(slots=True)
@@ -43,57 +41,44 @@ class _Block:
     at: int
     rows: list[list[str]] = field(default_factory=list)
 
-    def __str__(self) -> str:
-        return f"line {self.at}, *{one_line(self.keyword, 40)}"
-
     def option(self, name: str, default: str | None = None) -> str:
-        """An option in capitals, without the name of an instance."""
+        """An option in capitals, without an instance."""
         value = self.options.get(name) or default
         if value is None:
             raise InputError(f"no {name}=")
         return _plain(value)
 
-    def table(self, width: int) -> tuple[IntArray, FloatArray]:
-        """Labels ``(n,)`` and numbers ``(n, width - 1)`` of data lines of so many words each."""
-        for row in self.rows:
-            if len(row) != width:
-                raise InputError(f"{len(row)} numbers in a line, expected {width}")
-        values = _numbers(self.words).reshape(-1, width)
-        if np.any(values[:, 0] != np.rint(values[:, 0])):
-            raise InputError("labels that are no whole numbers")
-        return values[:, 0].astype(np.int64), values[:, 1:]
-
     @property
     def words(self) -> list[str]:
-        """Words of all data lines, without empty ones."""
+        """Words of all data lines."""
         return [word for row in self.rows for word in row if word]
 
 
 class Deck:
-    """What a deck states; nodes and elements count from 0 in its order.
+    """The content of a deck; nodes and elements are numbered from 0 in its order.
 
     Attributes
     ----------
     nodes : list of list
         ``(n, 3)``.
     cells : list of list
-        Nodes of each element: 4 of a shell, of which a triangle repeats the last, 2 of a truss.
+        Nodes of each element: 4 of a shell (a triangle repeats the last), 2 of a truss.
     sets : dict
-        NSET or ELSET -> name in capitals -> numbers, increasing.
+        NSET or ELSET -> name in capitals -> increasing numbers.
     sections : list of tuple
-        Elements, material, and thickness of shells (mm) or cross section of trusses (mm^2), 0
-        where none is given. Of two sections of an element the later one counts.
+        Elements, material, and thickness (mm) of shells or cross section (mm^2) of trusses, 0 if
+        not given. Later sections of an element override earlier ones.
     ogden : dict
         Material -> ``(t, 2)`` mu (MPa) and alpha of each term.
     pressures : list of tuple
-        Elements, pressure (MPa) against their normals at a share of 1, and its amplitude.
+        Elements, pressure (MPa) against their normals, and its amplitude.
     period : float
         s, of the step.
 
     Raises
     ------
     InputError
-        If the file is damaged, or states what is not read; the message names the line.
+        The file is damaged or has unsupported content; the message names the line.
     """
 
     def __init__(self, path: Path) -> None:
@@ -110,20 +95,19 @@ class Deck:
         self._axes: dict[int, set[int]] = defaultdict(set)
         self._material = self._instance = ""
         for block in _blocks(read_bytes(path).decode("utf-8-sig", "replace")):
+            at = f"line {block.at}, *{one_line(block.keyword, 40)}"
             try:
                 self._read(block)
             except KeyError as fault:
-                raise InputError(f"{block}: {one_line(fault, 60)} does not exist") from fault
+                raise InputError(f"{at}: {one_line(fault, 60)} does not exist") from fault
             except MvestError as fault:
-                raise InputError(f"{block}: {fault}") from fault
-        if not self.nodes or not self.cells:
-            raise InputError("holds no nodes or no elements")
-        if not self.period:
-            raise InputError("holds no step with a duration")
+                raise InputError(f"{at}: {fault}") from fault
+        if not self.nodes or not self.cells or not self.period:
+            raise InputError("holds no nodes, no elements or no step with a duration")
 
     @property
     def section(self) -> IntArray:
-        """Number ``(m,)`` of the section of each element; -1 where there is none."""
+        """Number ``(m,)`` of the section of each element; -1 without one."""
         result = np.full(len(self.cells), -1)
         for k, (members, _, _) in enumerate(self.sections):
             result[members] = k
@@ -136,42 +120,43 @@ class Deck:
 
     @property
     def held(self) -> IntArray:
-        """Nodes whose three coordinates are all prescribed."""
+        """Nodes with three prescribed coordinates."""
         held = [node for node, axes in self._axes.items() if {1, 2, 3} <= axes]
         return np.array(sorted(held), dtype=np.int64)
 
     def members(self, kind: str, name: str) -> IntArray:
-        """Numbers of a set (NSET or ELSET), whose instance may be left out.
+        """Numbers of a set (NSET or ELSET).
 
         Raises
         ------
         InputError
-            If there is no such set.
+            There is no such set.
         """
-        found = self.sets[kind].get(_plain(name))
-        if found is None:
-            known = one_line(", ".join(self.sets[kind]), 160) or "none"
-            raise InputError(f"no {WHAT[kind]} set {one_line(name, 60)!r}; there are {known}")
-        return found
+        members: IntArray = self._known(self.sets[kind], name, f"{kind} set")
+        return members
 
     def share(self, amplitude: str, times: FloatArray) -> FloatArray:
         """Share of the pressure at times ``(k,)`` s, constant before and after.
 
-        Between two points it runs as Abaqus' smooth step ``10 u^3 - 15 u^4 + 6 u^5``.
+        Between two points it is Abaqus' smooth step ``10 u^3 - 15 u^4 + 6 u^5``.
 
         Raises
         ------
         InputError
-            If there is no such amplitude.
+            There is no such amplitude.
         """
-        if amplitude not in self._amplitudes:
-            known = one_line(", ".join(self._amplitudes), 160) or "none"
-            raise InputError(f"amplitude {one_line(amplitude, 60)!r}, expected one of {known}")
-        at, values = self._amplitudes[amplitude]
+        at, values = self._known(self._amplitudes, amplitude, "amplitude")
         i = np.clip(np.searchsorted(at, times, side="right") - 1, 0, len(at) - 2)
         u = np.clip((times - at[i]) / (at[i + 1] - at[i]), 0.0, 1.0)
         rise = u**3 * (10 - 15 * u + 6 * u**2)
         return np.asarray(values[i] + rise * (values[i + 1] - values[i]))
+
+    @staticmethod
+    def _known(found: dict[str, Any], name: str, what: str) -> Any:
+        if _plain(name) not in found:
+            listed = one_line(", ".join(found), 160) or "none"
+            raise InputError(f"no {what} {one_line(name, 60)!r}; there are {listed}")
+        return found[_plain(name)]
 
     def _read(self, block: _Block) -> None:
         key = block.keyword
@@ -183,15 +168,13 @@ class Deck:
                     raise InputError("expected one instance, where its part is")
                 self._instance = block.option("NAME")
             case "NODE":
-                labels, points = block.table(4)
-                self._label("NSET", block, labels, len(self.nodes))
+                points = self._labelled("NSET", block, 4, len(self.nodes))
                 self.nodes.extend(points.tolist())
             case "ELEMENT":
                 kind, known = block.option("TYPE"), self._labels["NSET"]
                 if kind not in CORNERS:
                     raise InputError(f"type {one_line(kind, 20)}, expected {', '.join(CORNERS)}")
-                labels, nodes = block.table(1 + CORNERS[kind])
-                self._label("ELSET", block, labels, len(self.cells))
+                nodes = self._labelled("ELSET", block, 1 + CORNERS[kind], len(self.cells))
                 nodes = nodes if kind != "S3" else nodes[:, [0, 1, 2, 2]]
                 self.cells.extend([known[label] for label in row] for row in nodes.tolist())
             case "NSET" | "ELSET":
@@ -215,7 +198,12 @@ class Deck:
                     raise InputError(f"N = {count // 2}, expected so many pairs mu, alpha")
                 self.ogden[self._material] = values[:count].reshape(-1, 2)
             case "AMPLITUDE":
-                self._add_amplitude(block)
+                kind, values = block.option("DEFINITION", "TABULAR"), _numbers(block.words)
+                if kind != "SMOOTH STEP":
+                    raise InputError(f"{one_line(kind, 40)}, expected SMOOTH STEP")
+                if len(values) < 4 or len(values) % 2 or np.any(np.diff(values[::2]) <= 0):
+                    raise InputError("expected two or more times, increasing, each with a value")
+                self._amplitudes[block.option("NAME")] = values[::2], values[1::2]
             case "DYNAMIC":
                 if self.period:
                     raise InputError("a second step, expected one")
@@ -241,20 +229,24 @@ class Deck:
                     for members, side in self._surfaces[_plain(row[0])]:
                         self.pressures.append((members, side * value, amplitude))
 
-    def _label(self, kind: str, block: _Block, labels: IntArray, first: int) -> None:
-        """Labels of new nodes or elements, and the set that their block makes of them."""
-        known = self._labels[kind]
-        for number, label in enumerate(labels.tolist(), first):
-            if known.setdefault(label, number) != number:
-                raise InputError(f"label {label} of {WHAT[kind]}s occurs twice")
+    def _labelled(self, kind: str, block: _Block, width: int, first: int) -> FloatArray:
+        """Values ``(n, width - 1)`` of new nodes or elements, whose labels and set are stored."""
+        for row in block.rows:
+            if len(row) != width:
+                raise InputError(f"{len(row)} numbers in a line, expected {width}")
+        values, known = _numbers(block.words).reshape(-1, width), self._labels[kind]
+        for number, label in enumerate(values[:, 0].tolist(), first):
+            if label != int(label) or known.setdefault(int(label), number) != number:
+                raise InputError(f"label {label:g} is no whole number, or occurs twice")
         if kind in block.options:
-            self._add_set(kind, block.option(kind), first + np.arange(len(labels)))
+            self._add_set(kind, block.option(kind), first + np.arange(len(values)))
+        return values[:, 1:]
 
     def _add_set(self, kind: str, name: str, members: IntArray) -> None:
         self.sets[kind][name] = np.union1d(self.sets[kind].get(name, members), members)
 
     def _numbers_of(self, kind: str, words: Iterable[str]) -> IntArray:
-        """Numbers of labels and sets, increasing."""
+        """Increasing numbers of labels and sets."""
         found = set[int]()
         for word in map(_plain, words):
             if word.isdecimal():
@@ -263,18 +255,8 @@ class Deck:
                 found.update(self.sets[kind][word].tolist())
         return np.array(sorted(found), dtype=np.int64)
 
-    def _add_amplitude(self, block: _Block) -> None:
-        kind, words = block.option("DEFINITION", "TABULAR"), _numbers(block.words)
-        times, values = words[::2], words[1::2]
-        if kind != "SMOOTH STEP":
-            raise InputError(f"{one_line(kind, 40)}, expected SMOOTH STEP")
-        if len(times) != len(values) or len(times) < 2 or np.any(np.diff(times) <= 0):
-            raise InputError("expected two or more times, increasing, each with a value")
-        self._amplitudes[block.option("NAME")] = times, values
-
 
 def _blocks(text: str) -> list[_Block]:
-    """The blocks of a deck one after another."""
     blocks: list[_Block] = []
     for at, raw in enumerate(text.splitlines(), 1):
         line = raw.strip()
@@ -291,12 +273,11 @@ def _blocks(text: str) -> list[_Block]:
 
 
 def _plain(name: str) -> str:
-    """A name in capitals, words apart by one space, without that of its instance."""
+    """A name in capitals, with single spaces and without an instance."""
     return " ".join(name.split()).upper().rpartition(".")[2]
 
 
 def _numbers(words: Iterable[str]) -> FloatArray:
-    """Words as finite numbers."""
     try:
         values = np.array(list(words), dtype=np.float64)
     except ValueError as fault:

@@ -1,10 +1,10 @@
-"""A closure of a valve as it was computed with Abaqus: its input deck and the frames beside it.
+"""A valve closure computed with Abaqus: an input deck and its frames.
 
 A folder ``NAME`` holds ``NAME.inp`` and ``NAME_0.vtu``, ``NAME_1.vtu``, ..., the positions of all
-nodes of the deck at equal intervals of its step. Lengths are mm, stresses MPa, times s. Leaflets
-are shells, chordae trusses; which sets are leaflets, annulus and free edge is given by their names.
-The deck states thickness, chord materials and sections, which chord nodes are held (the papillary
-muscles), and the pressure. The frames state how annulus and papillary muscles move.
+nodes at equal intervals of the step. Lengths are mm, stresses MPa, times s. Leaflets are shells,
+chordae trusses; the caller names the sets of leaflets, annulus and free edge. The deck states
+thickness, chord materials and sections, the held chord nodes (papillary muscles), and the pressure.
+The frames state the motion of annulus and papillary muscles.
 
 Such a case is the Texas TriValve 1.1 (SoftTissueBiomechanicsLab/Texas_TriValve_1.1, CC BY 4.0;
 Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w), a human donor
@@ -34,33 +34,33 @@ from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coo
 from mvest.valve.mesh.remesh import remesh
 
 TOLERANCE_MM = 1e-3
-"""Frames are stored in single precision, whose rounding at 30 mm is 2e-6 mm."""
+"""Frames have single precision: 2e-6 mm at 30 mm."""
 SAME_MM = 1e-6
-"""Between anchors at one place."""
+"""Largest distance of coincident anchors."""
 MAX_FRAMES = 500
 EXTENT_MM = (5.0, 500.0)
-"""Of the leaflets: a valve in cm or m is not taken for one in mm."""
+"""Of the leaflets, to detect lengths in cm or m."""
 PRESSURE_MPA = (1e-4, 0.1)
 """1 to 750 mmHg."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """A valve at rest and as it was recorded closing.
+    """A valve at rest and its recorded closure.
 
     Attributes
     ----------
     valve : Valve
-        On its fine midsurface in frame 0, normals to the ventricle, fibres parallel to the annulus.
-        Its motion is that of the frames.
-    frames : ndarray
-        ``(f, n, 3)`` mm, recorded positions of the vertices.
-    times : ndarray
-        ``(f,)`` s, from 0 to the end of the step.
+        The fine midsurface in frame 0, normals to the ventricle, fibres parallel to the annulus,
+        and the motion of the frames.
+    frames : (f, n, 3) ndarray
+        mm, recorded positions of the vertices.
+    times : (f,) ndarray
+        s, from 0 to the end of the step.
     pressure : float
         MPa on the ventricular face at the end.
-    pressure_share : ndarray
-        ``(f,)`` share of the pressure.
+    pressure_share : (f,) ndarray
+        Share of the pressure.
     """
 
     valve: Valve
@@ -85,7 +85,7 @@ def recording_files(folder: Path) -> list[Path]:
     Raises
     ------
     InputError
-        If there is no deck, or frames are missing.
+        There is no deck, or frames are missing.
     """
     deck = folder / f"{folder.name}.inp"
     if not deck.is_file():
@@ -112,15 +112,14 @@ def read_recording(
     ----------
     folder : Path
     leaflets : mapping
-        Region -> element set. Names of sets are given with or without their instance, in any case.
+        Region -> element set, with or without its instance, in any case.
     annulus, free_edge : str
         Node sets.
 
     Raises
     ------
     InputError
-        If files are absent or damaged, the deck states what is not read, or frames and deck
-        contradict each other.
+        Files are absent or damaged, the deck has unsupported content, or contradicts the frames.
     """
     path, *files = recording_files(folder)
     with refusing(path, "input deck"):
@@ -131,10 +130,15 @@ def read_recording(
         surface, vertices, rims = _leaflets(deck, shells, annulus, free_edge, turned=pressure < 0)
         fibre = surface_coordinates(nodes[vertices], surface["triangles"], *rims).circumferential
         anchors, chordae = _chordae(deck, nodes, vertices)
-    points = np.stack([_frame(file, nodes) for file in files])
+    points = np.zeros((len(files), *nodes.shape))
+    for file, frame in zip(files, points, strict=True):
+        found = read_mesh(file).vertices
+        if found.shape != nodes.shape:
+            raise InputError(f"{file}: {len(found)} points, the deck has {len(nodes)} nodes")
+        frame[:] = found
     if not np.abs(points[0] - nodes).max() <= TOLERANCE_MM:
         raise InputError(f"{files[0]}: points are not the nodes of the deck")
-    # Frames are stored in single precision, the motion begins at the nodes of the deck.
+    # The motion begins at the nodes of the deck, which have double precision.
     ring, held = (nodes[k] + (points[:, k] - points[0, k]) for k in (vertices[rims[0]], anchors))
     with named(folder):
         tips, tip = _group_anchors(held)
@@ -147,22 +151,13 @@ def read_recording(
         free_edge=rims[1],
         papillary_tips=tips[0],
         chordae=replace(chordae, tip=tip[chordae.tip]),
-        # The phase is that by which a closure is paced.
         motion=Motion(t**3 * (10 - 15 * t + 6 * t**2), ring, tips),
     )
     return Recording(valve, points[:, vertices], times, abs(pressure), share)
 
 
-def _frame(file: Path, nodes: FloatArray) -> FloatArray:
-    """Recorded positions of the nodes of the deck."""
-    points = read_mesh(file).vertices
-    if points.shape != nodes.shape:
-        raise InputError(f"{file}: {len(points)} points, the deck has {len(nodes)} nodes")
-    return points
-
-
 def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArray, Chordae]:
-    """The anchors of the chordae, and these with the number of the anchor as that of their tip."""
+    """The anchors, and the chordae with numbers of anchors as numbers of tips."""
     trusses = deck.trusses
     edges, section = np.array([deck.cells[k] for k in trusses]), deck.section[trusses]
     if not trusses.size or section.min() < 0:
@@ -171,7 +166,7 @@ def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArra
     if not anchors.size:
         raise InputError("no node of the chordae is held, so no papillary muscle is known")
     anchor, insertion, length, share = trace_cables(nodes, edges, anchors, leaflets)
-    # The family of a cable is the section of the first truss in the deck at its insertion.
+    # The family of a cable is the section of the first truss at its insertion.
     ends, first = np.unique(edges, return_index=True)
     used, of_truss = np.unique(section, return_inverse=True)
     family = of_truss[first // 2][np.searchsorted(ends, insertion)]
@@ -217,16 +212,10 @@ def _pressure(deck: Deck, leaflets: IntArray, times: FloatArray) -> tuple[float,
 def _leaflets(
     deck: Deck, groups: Sequence[IntArray], annulus: str, free_edge: str, *, turned: bool
 ) -> tuple[dict[str, Any], IntArray, list[IntArray]]:
-    """The leaflets as triangles, whose normals are the shells' or, if ``turned``, against them.
+    """The leaflets as triangles with the normals of the shells or, if ``turned``, opposite ones.
 
-    Returns
-    -------
-    surface : dict
-        ``triangles``, ``region`` and ``thickness``.
-    vertices : ndarray
-        Their nodes in the deck, increasing.
-    rims : list of ndarray
-        Vertices of annulus and free edge in loop order.
+    Returns ``triangles``, ``region`` and ``thickness``; the increasing numbers of their nodes; and
+    the vertices of annulus and free edge in loop order.
     """
     elements = np.concatenate(groups)
     if not all(map(len, groups)) or np.isin(elements, deck.trusses).any():
@@ -264,7 +253,7 @@ def _leaflets(
     sizes = np.array([*(size for _, _, size in deck.sections), 0.0])[deck.section[elements]]
     if not sizes.all():
         raise InputError("shells without a section that states a thickness")
-    # Where leaflets meet, the thicker one counts.
+    # The thicker leaflet counts where two meet.
     thickness = np.zeros(len(vertices))
     np.maximum.at(thickness, corners.ravel(), np.repeat(sizes, 4))
     surface = {"triangles": triangles, "region": region[element], "thickness": thickness}
@@ -272,10 +261,10 @@ def _leaflets(
 
 
 def _split(vertices: FloatArray, quads: IntArray, on_rim: IntArray) -> tuple[IntArray, IntArray]:
-    """Two triangles per quad along the shorter diagonal, and the element of each triangle.
+    """Two triangles per quad, cut along the shorter diagonal, and the element of each triangle.
 
-    A quad with two sides on one rim is cut from their common corner, so that no triangle has all
-    three corners on that rim.
+    A quad with two sides on one rim is cut from their common corner, so that no triangle has three
+    corners on that rim.
     """
     first, second = (
         np.linalg.norm(vertices[quads[:, i + 2]] - vertices[quads[:, i]], axis=1) for i in (0, 1)

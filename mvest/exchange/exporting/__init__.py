@@ -1,6 +1,5 @@
-"""Cases and results as other programs read them: one module for each kind of target.
+"""Exporters of cases and results, one module per target.
 
-A module NAME has ``export_NAME(source, target, options)``, which writes `target` and gives its path
-back, and the frozen dataclass of its options: ``mvest export NAME SOURCE TARGET`` finds both by
-these names.
+A module NAME has ``export_NAME(source, target, options)``, which writes `target` and returns its
+path, and the frozen dataclass of its options. ``mvest export NAME`` finds both by these names.
 """

@@ -27,51 +27,51 @@ GENERIC = {
 }
 """E_f (MPa) and E_f over E_perp of the method paper (ISBI 2013)."""
 CONTACT_COLUMNS, CONTACT_ROWS = 144, 32
-"""Points at which the valve is sampled for patches of chordae and the annulus."""
+"""Samples of the valve for patches of chordae and the annulus."""
 CONTACTS = ("potential", "none")
 SAMPLES, TOE_POINTS = 61, 41
-"""Points of pressure and motion over the ramp, and of a chord's force over its toe."""
+"""Points of the curves of pressure and motion over the ramp, and of a chord's force over its toe.
+"""
 STEPS = 30
-"""Time steps over the ramp to begin with; FEBio changes them."""
+"""Initial number of time steps over the ramp; FEBio adapts it."""
 EXPONENT = 4.0
-"""p of the contact potential, FEBio's own choice."""
+"""p of the contact potential, FEBio's default."""
 
 
 @dataclass(frozen=True, slots=True)
 class FebioOptions:
-    """What is not in the case, and what is chosen in FEBio.
+    """What the case does not state, and choices in FEBio.
 
     Attributes
     ----------
     E_f, ratio : tuple of float, optional
-        MPa and E_f over E_perp of each leaflet, in the order of the case's regions, as a run of
-        `own-valve` estimated them; by default those of a generic anterior and posterior leaflet.
+        MPa and E_f over E_perp of each leaflet, in the order of the case's regions; generic by
+        default.
     nu, reading : float, str
-        Poisson ratio and how it is read (A or C).
+        Poisson ratio and its option (A or C).
     pressure_mmHg : float, optional
         By default that of the closed frame.
     mesh : str
-        ``structured`` (two leaflets: bricks) or ``tetwild`` (tetrahedra).
+        ``structured`` (bricks, of two leaflets) or ``tetwild`` (tetrahedra).
     columns, rows : int
         Bricks around the valve and along the leaflets.
     edge_length : float
         mm, of tetrahedra.
     law : str
-        Of the linear tissue: ``neo-hookean``, which is nearer where the tissue is compressed and
-        keeps elements from turning over, or ``orthotropic`` (:mod:`mvest.exchange.febio.mesh`).
+        ``neo-hookean``, which is nearer to the linear law in compression and keeps elements from
+        inverting, or ``orthotropic`` (:mod:`mvest.exchange.febio.mesh`).
     contact : str
         ``potential`` (FEBio's contact potential between the atrial faces) or ``none``.
     contact_gap_mm : float
-        Between the atrial faces of two flat leaflets that press on each other with the reference
-        pressure of the contact.
+        Gap of the atrial faces of two flat leaflets under the reference pressure of the contact.
     contact_reach_mm : float
         Gap (mm) at which contact begins.
     dynamic : bool
         With inertia and damping by mass, to the end of the protocol; otherwise static, to the end
         of its ramp.
     density_factor : float
-        On the density of a dynamic run: heavier leaflets take larger steps of time, and come to
-        rest where lighter ones do.
+        Factor on the density of a dynamic run. Heavier leaflets allow larger time steps and come to
+        rest at the same state.
     """
 
     E_f: tuple[float, ...] | None = None
@@ -106,13 +106,13 @@ class FebioOptions:
 def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
     """Write the closure of a case folder for FEBio.
 
-    Run it with ``febio4 -i TARGET``. The positions of all nodes at every step are then in
-    ``TARGET_positions.csv``, and all else in FEBio's own plot file.
+    Run it with ``febio4 -i TARGET``. FEBio writes the positions of all nodes at every step to
+    ``TARGET_positions.csv``, and everything else to its plot file.
 
     Raises
     ------
     InputError, GeometryError, MaterialError
-        If the source is not such a folder, or the valve cannot be meshed or has no counterpart.
+        The source is no case, or FEBio has no counterpart of the valve.
     """
     if target.suffix.lower() != ".feb":
         raise InputError(f"{target}: expected a name that ends in .feb")
@@ -124,7 +124,7 @@ def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
 
 
 def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
-    """The closure of a case with everything at its value: nothing in it is a parameter."""
+    """The closure of a case without parameters."""
     names = case.surface.region_names
     chosen: dict[str, list[float]] = {}
     for what, given in (("E_f", options.E_f), ("ratio", options.ratio)):
@@ -155,14 +155,12 @@ def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
 
 
 def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) -> FebDocument:
-    """The closure of a valve with parameters ``m (p,)``, which are values in the file.
+    """The closure of a valve at parameters ``m (p,)``.
 
     Raises
     ------
-    InputError
-        If the mesh has no counterpart.
-    MaterialError
-        If a modulus is inadmissible.
+    InputError, MaterialError
+        FEBio has no counterpart of the mesh, or a modulus is inadmissible.
     """
     values = {**model.fixed, **dict(zip(model.names, map(float, m), strict=True))}
     mechanics, protocol = model.settings, model.settings.protocol
@@ -212,7 +210,7 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
 
 
 def _chord_forces(system: System, ends: FloatArray) -> list[FloatArray]:
-    """Elongation against the distance at rest (mm) and force (N) of chords, ends ``(c, 2, 3)``."""
+    """Elongation relative to the initial length (mm) and force (N) of chords ``(c, 2, 3)``."""
     cables, factors = system.cables, system.factors
     assert cables is not None
     apart = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
@@ -228,9 +226,9 @@ def _chord_forces(system: System, ends: FloatArray) -> list[FloatArray]:
 def _pressure_of_sheets(gap: float, p: float, inner: float, outer: float) -> float:
     r"""Pressure (MPa) between two flat sheets that are ``gap`` mm apart, for kc = 1.
 
-    With the force f(r) between two points, :math:`2 \pi d \int_d^\infty f(r) dr`: the derivative of
-    the energy :math:`2 \pi \int_d^\infty \varphi(r) r dr` by d. FEBio's force is :math:`r^{-p}`
-    less a constant within ``inner``, and falls to zero as a parabola at ``outer``.
+    With the force f(r) between two points it is :math:`2 \pi d \int_d^\infty f(r) dr`, the
+    derivative of the energy :math:`2 \pi \int_d^\infty \varphi(r) r dr` by d. FEBio's force is
+    :math:`r^{-p}` minus a constant up to ``inner``, and falls to zero as a parabola at ``outer``.
     """
     c1 = 0.5 * p / ((outer - inner) * inner ** (p + 1))
     c2 = inner**-p - c1 * (inner - outer) ** 2

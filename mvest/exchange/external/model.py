@@ -1,6 +1,6 @@
 """A program as an observation model: parameters in, positions and derivatives out, all in files.
 
-Where the program gives no derivatives, they are differences of its predictions.
+If the program gives no derivatives, they are differences of its predictions.
 """
 
 from __future__ import annotations
@@ -32,27 +32,25 @@ from mvest.provenance import config_hash
 from mvest.reading.documents import validated
 from mvest.typing import FloatArray
 
-SCHEMES = ("central", "forward")
-
 
 @dataclass(frozen=True, slots=True)
 class Differences:
     """Difference quotients ``(h(m + d) - h(m - d)) / 2d`` or ``(h(m + d) - h(m)) / d``.
 
-    Central ones cost two runs for each parameter and err by the square of the step, forward ones
-    cost one and err by the step itself. A program that solves to a tolerance puts that tolerance,
-    divided by the step, on top: choose the step much larger than the tolerance.
+    Central differences cost two runs per parameter, with an error of second order in the step;
+    forward differences cost one run, with an error of first order. The tolerance of the program's
+    solver adds an error of tolerance over step: choose a step much larger than the tolerance.
 
     Attributes
     ----------
     scheme : str
         ``central`` or ``forward``.
     relative_step : float
-        Part of a parameter's size by which it is changed.
+        Step over the size of a parameter.
     floor : float
-        Size that a parameter has at least, in its unit: needed where one may be zero.
+        Least size of a parameter, in its unit; needed if it may be zero.
     processes : int
-        Runs at a time.
+        Number of simultaneous runs.
     """
 
     scheme: str = "central"
@@ -61,41 +59,35 @@ class Differences:
     processes: int = 1
 
     def __post_init__(self) -> None:
-        for name, holds, expected in (
-            ("scheme", self.scheme in SCHEMES, f"one of {', '.join(SCHEMES)}"),
-            ("relative_step", 0 < self.relative_step < 1, "between 0 and 1"),
-            ("floor", 0 <= self.floor < np.inf, "at least 0"),
-            ("processes", self.processes >= 1, "at least 1"),
-        ):
-            if not holds:
-                raise ConfigurationError(
-                    f"differences {name} = {getattr(self, name)!r}, expected {expected}"
-                )
+        if self.scheme not in ("central", "forward"):
+            raise ConfigurationError(f"differences {self.scheme!r}, expected central or forward")
+        if not (0 < self.relative_step < 1 and self.floor >= 0 and self.processes >= 1):
+            raise ConfigurationError(
+                f"{self}, expected 0 < relative_step < 1 and no negative floor"
+            )
 
     def neighbours(self, m: FloatArray) -> FloatArray:
-        """Parameters ``(k, p)`` at which the model is to be run: upper ones, then lower ones.
+        """Parameters ``(k, p)`` of the runs: upper neighbours of ``m``, then lower ones.
 
         Raises
         ------
         InputError
-            If a parameter is so small that its step has no size.
+            A parameter is so small that its step vanishes.
         """
         step = self.relative_step * np.maximum(np.abs(m), self.floor)
-        if not np.all(m + step != m):
-            k = int(np.flatnonzero(m + step == m)[0])
+        if len(bad := np.flatnonzero(m + step == m)):
             raise InputError(
-                f"parameter {k} is {m[k]:g}: a relative step of it is none; expected a floor, its "
+                f"parameter {bad[0]} is {m[bad[0]]:g}, and so is its step; expected a floor, its "
                 "usual size"
             )
-        moves = np.diag(step)
-        return np.concatenate([m + moves, m - moves] if self.scheme == "central" else [m + moves])
+        upper, lower = m + np.diag(step), m - np.diag(step)
+        return np.concatenate([upper, lower]) if self.scheme == "central" else upper
 
     def jacobian(self, m: FloatArray, y: FloatArray, predicted: Sequence[FloatArray]) -> FloatArray:
-        """Derivatives ``(n, p)`` from predictions ``(n,)`` at `neighbours`, in their order."""
-        points, values = self.neighbours(m), np.array(predicted)
-        p = m.size
+        """Derivatives ``(n, p)`` from predictions ``(n,)`` at the `neighbours`."""
+        points, values, p = self.neighbours(m), np.array(predicted), m.size
         lower, at = (values[p:], points[p:]) if self.scheme == "central" else (y, m)
-        # What the parameters really differ by, rounding included.
+        # The differences after rounding.
         return np.asarray((values[:p] - lower).T / np.diagonal(points[:p] - at))
 
 
@@ -103,46 +95,45 @@ class Differences:
 class ProcessModel:
     """Coordinates ``(3 n,)`` mm that a program predicts for parameters ``(p,)``.
 
-    An observation model of the filters: whatever goes wrong with a run is the reason of a failed
-    prediction. Each run has a folder of its own below ``folder``, named by the hash of all that the
-    run depends on; a run that is finished there is not done again.
+    This is an observation model for the filters: a run that fails is a failed prediction with a
+    reason. Each run has its own folder below ``folder``, named by the hash of all that the run
+    depends on. A finished run is reused.
 
     Parameters
     ----------
     command : Command
     folder : Path
-        Where the runs are kept; made if need be.
+        Parent folder of the runs; created if missing.
     names : sequence of str
-        Of the parameters.
+        Names of the parameters.
     count : int
         Number n of observed points.
     units : sequence of str, optional
-        Of the parameters; empty if not given.
+        Units of the parameters.
     points : ndarray, optional
-        ``(n, 3)`` mm reference positions of the points to be observed, where the program
-        needs them.
+        ``(n, 3)`` mm, reference positions of the observed points for the program.
     settings : mapping, optional
-        Plain data for the program, handed on as they are.
+        Plain data for the program.
     differences : Differences or None
-        How derivatives are made if the program gives none; None demands them of the program.
+        How to differentiate if the program does not; None requires derivatives of the program.
     reuse : bool
-        Whether finished runs serve again.
+        Whether finished runs are reused.
     inputs : sequence of Path
-        Files and folders whose contents a run depends on beside those that the command names
-        (`files_of_command`): after a change of one of them nothing finished serves any more, and a
-        run during which one is changed counts as failed.
+        Files and folders that a run depends on in addition to those of the command
+        (`files_of_command`). After a change of one of them no finished run is reused; a run during
+        which one changes fails.
 
     Attributes
     ----------
     runs, reused : int
-        How often a program was started, and how often a finished run served instead.
+        Number of runs that were started, and of finished ones that were reused.
     own_jacobian : bool
-        Whether the last prediction's derivatives are the program's own.
+        Whether the program itself gave the last derivatives.
 
     Raises
     ------
     InputError, ConfigurationError
-        If the folder cannot be made, an input cannot be read or the points have another shape.
+        The folder cannot be made, an input cannot be read, or points, names and units do not fit.
     """
 
     command: Command
@@ -170,8 +161,8 @@ class ProcessModel:
                 f"parameters {', '.join(self.names)} in {', '.join(units)}; expected different "
                 "names, and a unit of each"
             )
-        # Inputs, units and names are in order, or this says what is not.
-        self._place(self._request(np.zeros(len(self.names)), True))
+        # Checks names and inputs.
+        self._run_folder(self._request(np.zeros(len(self.names)), True))
         require_writable(self.folder)
 
     def __call__(self, m: FloatArray, /) -> Prediction:
@@ -180,43 +171,30 @@ class ProcessModel:
             raise InputError(f"{m.size} parameters, expected {', '.join(self.names)}")
         if not np.all(np.isfinite(m)):
             return Prediction.failed(f"the parameters {m} are not finite")
-        (first,) = self._all(m[None], jacobian=True)
+        (first,) = self._predictions(m[None], jacobian=True)
         self.own_jacobian = first.differentiated
         if not first.converged or first.differentiated:
             return first
-        if self.differences is None:
-            return Prediction.failed("the program gives no derivatives: jacobian.csv is missing")
-        jacobian = self.by_differences(m, first.y)
-        if isinstance(jacobian, str):
-            return Prediction.failed(jacobian)
-        return Prediction(first.y, jacobian)
+        found = self.by_differences(m, first.y)
+        return Prediction.failed(found) if isinstance(found, str) else Prediction(first.y, found)
 
     def by_differences(self, m: FloatArray, y: FloatArray) -> FloatArray | str:
-        """Derivatives ``(3 n, p)`` by differences, or the reason why there are none.
-
-        Parameters
-        ----------
-        m : ndarray
-            ``(p,)``.
-        y : ndarray
-            ``(3 n,)`` mm, the prediction at ``m``.
-        """
+        """Derivatives ``(3 n, p)`` of the prediction ``y (3 n,)`` mm, or why there are none."""
         if self.differences is None:
-            return "no differences are configured"
+            return "no derivatives: jacobian.csv is missing, differences=none"
         try:
             points = self.differences.neighbours(m)
         except InputError as error:
             return str(error)
-        answers = self._all(points, jacobian=False)
-        for at, answer in zip(points, answers, strict=True):
-            if not answer.converged:
+        found = self._predictions(points, jacobian=False)
+        for at, one in zip(points, found, strict=True):
+            if not one.converged:
                 values = ", ".join(f"{n} = {v:g}" for n, v in zip(self.names, at, strict=True))
-                return f"run for a difference at {values}: {answer.reason}"
-        return self.differences.jacobian(m, y, [answer.y for answer in answers])
+                return f"run for a difference at {values}: {one.reason}"
+        return self.differences.jacobian(m, y, [one.y for one in found])
 
     def _request(self, m: FloatArray, jacobian: bool) -> RunRequest:
-        units = self.units or [""] * len(self.names)
-        rows = zip(self.names, m.tolist(), units, strict=True)
+        rows = zip(self.names, m.tolist(), self.units or [""] * len(self.names), strict=True)
         request = {
             "parameters": [{"name": n, "value": value, "unit": unit} for n, value, unit in rows],
             "points": self.count,
@@ -225,10 +203,10 @@ class ProcessModel:
         }
         return validated(RunRequest, request, "request")
 
-    def _all(self, points: FloatArray, jacobian: bool) -> list[Prediction]:
-        """Answers at all points, several at a time; leaving early ends the programs."""
+    def _predictions(self, points: FloatArray, jacobian: bool) -> list[Prediction]:
+        """Predictions at all points, several at a time; an exception ends all programs."""
         requests = [self._request(m, jacobian) for m in points]
-        folders = [self._place(request) for request in requests]
+        folders = [self._run_folder(request) for request in requests]
         entries = [
             Entry(folder / "answer", partial(read_answer, request=request))
             for folder, request in zip(folders, requests, strict=True)
@@ -236,52 +214,48 @@ class ProcessModel:
         if not self.reuse:
             for entry in entries:
                 shutil.rmtree(entry.path, ignore_errors=True)
-
         before = self.runs
 
-        def answers(missing: list[int]) -> Iterator[Prediction]:
+        def run(missing: list[int]) -> Iterator[Prediction]:
             self.runs += len(missing)
             size = 1 if self.differences is None else self.differences.processes
             for first in range(0, len(missing), size):
+                batch = missing[first : first + size]
                 with ExitStack() as stack:
-                    ended = {
-                        k: self._started(folders[k], requests[k], stack)
-                        for k in missing[first : first + size]
-                    }
-                    yield from [self._read(folders[k], requests[k], ended[k]()) for k in ended]
+                    ended = [self._started(folders[k], requests[k], stack) for k in batch]
+                    for k, end in zip(batch, ended, strict=True):
+                        yield self._read(folders[k], requests[k], end())
 
         try:
-            found = get_or_make(entries, answers, _move_answer, keep=attrgetter("converged"))
+            found = get_or_make(entries, run, _move_answer, keep=attrgetter("converged"))
         except (OSError, InputError) as error:
             return [Prediction.failed(str(error))] * len(points)
         self.reused += len(points) - (self.runs - before)
         return found
 
     def _started(self, folder: Path, request: RunRequest, stack: ExitStack) -> Callable[[], str]:
-        """Start a run; returns the function that waits for its end (`Command.started`)."""
-        for name in ANSWERS:
-            # An old answer is not to be taken for that of a program that writes none.
+        for name in ANSWERS:  # of an earlier run, which the program may not overwrite
             (folder / name).unlink(missing_ok=True)
         write_request(folder, request, self.points)
         return stack.enter_context(self.command.started(folder))
 
-    def _read(self, folder: Path, request: RunRequest, reason: str) -> Prediction:
-        """The answer of a run whose program failed for a reason, which may be empty."""
+    def _read(self, folder: Path, request: RunRequest, failure: str) -> Prediction:
+        """The prediction of a run; ``failure`` is why the program failed, or empty."""
         try:
             answer = read_answer(folder, request)
         except InputError as error:
             answer = Prediction.failed(str(error))
-        if not answer.converged and not (reason and "missing" in answer.reason):
-            reason = "; ".join(filter(None, [reason, answer.reason]))
-        if not reason and self._place(request) != folder:
-            reason = "a file that it depends on was changed while it ran"
-        return Prediction.failed(f"{folder.name}: {reason}") if reason else answer
+        if not answer.converged and not (failure and "missing" in answer.reason):
+            failure = "; ".join(filter(None, [failure, answer.reason]))
+        if not failure and self._run_folder(request) != folder:
+            failure = "a file that it depends on was changed while it ran"
+        return Prediction.failed(f"{folder.name}: {failure}") if failure else answer
 
-    def _place(self, request: RunRequest) -> Path:
-        """The folder of a run, named by the SHA-256 of all that its answer depends on."""
+    def _run_folder(self, request: RunRequest) -> Path:
+        """The folder of a run, named by the SHA-256 of all that the prediction depends on."""
         files = files_of_command(self.command.arguments, self.command.environment)
         files |= {str(path): path for path in self.inputs}
-        named = config_hash(
+        digest = config_hash(
             {
                 "request": request.model_dump(),
                 "command": self.command.arguments,
@@ -290,11 +264,11 @@ class ProcessModel:
                 "inputs": {name: sha256_of(path) for name, path in files.items()},
             }
         )
-        return self.folder / f"run-{named[:24]}"
+        return self.folder / f"run-{digest[:24]}"
 
 
 def _move_answer(target: Path, _: Prediction) -> None:
-    """Move the files of an answer from the folder of their run to a folder there."""
+    """Move the response from the folder of its run to a subfolder."""
     target.mkdir()
     for file in filter(Path.is_file, (target.parent / name for name in ANSWERS)):
         file.rename(target / file.name)

@@ -1,8 +1,4 @@
-"""FEBio's input file.
-
-Written by this project after the reader of FEBio 4.11 (``FEBioXML``): every tag and attribute is
-one that it asks for. Numbers are written so that they are read back the same.
-"""
+"""FEBio's input file, after the reader of FEBio 4.11 (``FEBioXML``). Numbers keep all digits."""
 
 from __future__ import annotations
 
@@ -24,27 +20,27 @@ SECTIONS = ("Module", "Control", "Material", "Mesh", "MeshDomains", "MeshData", 
             "Contact", "Constraints", "Discrete", "LoadData", "Output")  # fmt: skip
 """In the order in which FEBio can resolve names."""
 UPDATES = 10
-"""By BFGS; FEBio's tangent of its neo-Hookean law is not exact."""
+"""BFGS updates; FEBio's tangent of its neo-Hookean law is not exact."""
 
 
 class FebDocument:
-    """A body, to which each method adds something that acts on it.
+    """A body; each method adds something that acts on it.
 
     Parameters
     ----------
     mesh : SolidMesh
-        In elements that FEBio has (`mvest.exchange.febio.mesh.febio_mesh`).
+        With elements of FEBio (`mvest.exchange.febio.mesh.febio_mesh`).
     laws : sequence of FebLaw
         One per region.
     end, step : float
-        s, and the first and largest time step.
+        s, the end, and the first and largest time step.
     tolerance : float
-        Of displacements, relative; that of the energy is its square.
+        Relative, of displacements; its square is that of the energy.
     dynamic : bool
-        With inertia (the generalised alpha rule at its most dissipative) and `UPDATES` between two
-        tangents; or static, by Newton's method.
+        With inertia (the generalised alpha rule at its most dissipative) and BFGS; or static, by
+        Newton's method.
     further : (k, 3) mm
-        Nodes that belong to no element; they are numbered after those of the mesh.
+        Nodes without elements, numbered after those of the mesh.
     density : float
         t/mm^3.
     """
@@ -113,9 +109,9 @@ class FebDocument:
         curve: FloatArray,
         axes: Sequence[str] = AXES,
     ) -> None:
-        """Move nodes ``(k,)`` by ``displacement (k, 3)`` mm along some axes; zeros hold them.
+        """Move nodes ``(k,)`` by ``displacement (k, 3)`` mm along some axes; zeros fix them.
 
-        ``curve (c, 2)`` are times and the shares of it.
+        ``curve (c, 2)`` are times and shares.
         """
         _add(self._at["Mesh"], "NodeSet", nodes + 1, name=name)
         for axis, values in zip(AXES, displacement.T, strict=True):
@@ -146,7 +142,7 @@ class FebDocument:
         _fill(_add(self._at["Loads"], "body_load", type="mass damping"), C=alpha)
 
     def average(self, nodes: IntArray, of: Embedding) -> None:
-        """Let nodes ``(k,)`` follow weighted averages ``(k,)`` of others, as linear constraints."""
+        """Tie nodes ``(k,)`` to weighted averages ``(k,)`` of others by linear constraints."""
         for (node, terms), axis in itertools.product(zip(nodes, _sums(of), strict=True), AXES):
             follow = _add(self._at["Boundary"], "bc", type="linear constraint")
             _fill(follow, node=node + 1, dof=axis)
@@ -154,7 +150,7 @@ class FebDocument:
                 _fill(_add(follow, "child_dof"), node=member, dof=axis, value=weight)
 
     def support(self, targets: IntArray, of: Embedding, stiffness: FloatArray) -> None:
-        """Draw weighted averages ``(k,)`` of nodes to nodes ``(k,)`` by ``stiffness (k,)`` N/mm."""
+        """Pull weighted averages ``(k,)`` of nodes to nodes ``(k,)`` by ``stiffness (k,)`` N/mm."""
         largest = stiffness.max()
         constraint = _add(self._at["Constraints"], "constraint", type="linear constraint")
         constraint.set("name", "support")
@@ -167,7 +163,7 @@ class FebDocument:
             _add(own, "node", -factor, id=target + 1, bc=axis)
             for member, weight in terms:
                 _add(own, "node", factor * weight, id=member, bc=axis)
-        # Nodes of no element have no freedom in FEBio: a spring without force gives them some.
+        # Nodes without elements have no degrees of freedom in FEBio; a weak spring adds them.
         material = self._spring("targets", np.stack([targets, np.roll(targets, 1)], axis=1))
         material.attrib |= {"type": "linear spring", "name": "none"}
         _fill(material, E=1e-12)
@@ -175,8 +171,8 @@ class FebDocument:
     def pull(self, pairs: IntArray, forces: Sequence[FloatArray]) -> None:
         """Springs between nodes ``(k, 2)``.
 
-        Each force ``(p, 2)`` is elongation against the distance at rest (mm) and force (N), linear
-        between the points and beyond them.
+        Each force ``(p, 2)`` is elongation from the initial length (mm) and force (N), linear
+        between and beyond the points.
         """
         for k, (pair, force) in enumerate(zip(pairs, forces, strict=True)):
             material = self._spring(f"spring_{k}", pair[None])
@@ -187,7 +183,7 @@ class FebDocument:
             _points(function, force)
 
     def touch(self, faces: IntArray, **parameters: float) -> None:
-        """Contact potential of faces of the mesh with themselves; parameters are FEBio's."""
+        """Contact potential between faces of the mesh, with FEBio's parameters."""
         self._surface("atrial", faces)
         pair = _add(self._at["Mesh"], "SurfacePair", name="atrial_pair")
         _fill(pair, primary="atrial", secondary="atrial")
@@ -196,16 +192,15 @@ class FebDocument:
         _fill(contact, **parameters)
 
     def write(self, path: Path, remark: str = "") -> Path:
-        """Write the file, with a remark at its head; FEBio logs positions into `positions_file`.
+        """Write the file with a remark at its head; FEBio will log to `positions_file`.
 
         Raises
         ------
         InputError
-            If it cannot be written.
+            The file cannot be written.
         """
         self._log.set("file", positions_file(path).name)
         root = Xml.Element("febio_spec", version="4.0")
-        # Two hyphens end a comment.
         root.append(Xml.Comment(f" {remark.replace('--', '- -')} "))
         root.extend(section for section in self._at.values() if len(section) or section.attrib)
         Xml.indent(root, " ")
@@ -213,7 +208,6 @@ class FebDocument:
         return write_atomically(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')
 
     def _curve(self, curve: FloatArray) -> int:
-        """Number of a load curve."""
         self._curves += 1
         at = _add(self._at["LoadData"], "load_controller", id=self._curves, type="loadcurve")
         _fill(at, interpolate="LINEAR", extend="CONSTANT")
@@ -226,7 +220,7 @@ class FebDocument:
         shape = mesh.reference.shape(mesh.reference.centre)[0]
         for j, along in enumerate(np.einsum("a,mai->mi", shape, mesh.fibre[own]), start=1):
             a = along / np.linalg.norm(along)
-            # Any other direction: the laws are the same all around the fibre.
+            # d is any other direction: the laws are isotropic around the fibre.
             _fill(_add(data, "elem", lid=j), a=a, d=np.roll(a, 1) + np.array([0.1, 0.2, 0.3]))
 
     def _surface(self, name: str, faces: IntArray) -> None:
@@ -236,7 +230,7 @@ class FebDocument:
             _add(surface, self._face, face, id=k)
 
     def _spring(self, name: str, pairs: IntArray) -> Xml.Element:
-        """A material of springs between nodes ``(k, 2)``, yet to be filled."""
+        """An empty material of springs between nodes ``(k, 2)``."""
         connected = _add(self._at["Mesh"], "DiscreteSet", name=name)
         for pair in pairs:
             _add(connected, "delem", pair + 1)
@@ -249,7 +243,7 @@ class FebDocument:
 
 
 def positions_file(path: Path) -> Path:
-    """Where FEBio logs the positions of the nodes of an input file."""
+    """The file to which FEBio logs the positions of the nodes."""
     return path.with_name(f"{path.stem}_positions.csv")
 
 

@@ -1,17 +1,16 @@
-r"""Mesh and materials in the terms of FEBio: its elements, and the law of each region.
+r"""Elements and materials of FEBio.
 
-The linear law of this project is :math:`\tfrac12 \epsilon : C : \epsilon` of the Biot strain
-(:mod:`mvest.mechanics.law.biot`). FEBio has no such law; two of its materials are offered.
-Both have the same stiffness at rest.
+FEBio has no linear law of the Biot strain, :math:`\tfrac12 \epsilon : C : \epsilon`
+(:mod:`mvest.mechanics.law.biot`). Two of its materials have the same stiffness at rest:
 
 ``orthotropic``
     ``orthotropic elastic``: the same C, of the Green-Lagrange strain (St. Venant's law).
 ``neo-hookean``
     ``neo-Hookean transiso``: the same moduli in a neo-Hookean form.
 
-Node orders are those of FEBio's shape functions (``FESolidElementShape.cpp``): corners of the lower
-face counterclockwise, of the upper face, middles of the lower, of the upper, of the upright edges,
-and of a brick the middles of its sides, of the lower and the upper face, and its centre.
+Node orders follow FEBio's shape functions (``FESolidElementShape.cpp``): corners of the lower face
+counterclockwise, corners of the upper face, midpoints of the lower, the upper and the upright
+edges; then, of a brick, midpoints of its sides, of the lower and the upper face, and its centre.
 """
 
 from __future__ import annotations
@@ -35,16 +34,16 @@ LAWS = {"orthotropic": "orthotropic elastic", "neo-hookean": "neo-Hookean transi
 BRICK = np.array([0, 2, 8, 6, 18, 20, 26, 24, 1, 5, 7, 3, 19, 23, 25, 21, 9, 11, 17, 15, 10, 14, 16,
                   12, 4, 22, 13])  # fmt: skip
 WEDGE = np.array([0, 1, 2, 12, 13, 14, 3, 4, 5, 15, 16, 17, 6, 7, 8])
-"""Nodes of hex27 and wedge18 in FEBio's order; it has no nodes in the middle of a wedge's sides."""
+"""Nodes of hex27 and wedge18 in FEBio's order; FEBio's wedge has no midpoints of its sides."""
 QUADRILATERAL = np.array([0, 2, 8, 6, 1, 5, 7, 3, 4])
-"""Nodes of quad9 in FEBio's order; triangles are alike."""
+"""Nodes of quad9 in FEBio's order; triangles have the same order."""
 NAMES = {
     "tet4": ("tet4", {}, np.arange(4)),
     "tet10": ("tet10", {"elem_type": "TET10G4"}, np.arange(10)),
     "hex27": ("hex27", {}, BRICK),
     "wedge18": ("penta15", {}, WEDGE),
 }
-"""Element -> its name in FEBio, the rule of integration where it has a choice, its nodes."""
+"""Element -> FEBio's name, integration rule if there is a choice, and nodes."""
 UPRIGHT = {"hex18": "hex27", "wedge12": "wedge18"}
 """Elements that get nodes halfway through the thickness."""
 
@@ -64,14 +63,14 @@ def febio_law(tissue: TransverselyIsotropic, kind: str = "orthotropic") -> FebLa
 
 
 def febio_mesh(mesh: SolidMesh) -> SolidMesh:
-    """The mesh in elements of `NAMES`, which FEBio has; its first nodes are those of ``mesh``.
+    """The mesh with elements of `NAMES`; its first nodes are those of ``mesh``.
 
-    Elements of two layers of nodes get a third one halfway between them.
+    Elements with two layers of nodes get a third one halfway between them.
 
     Raises
     ------
     InputError
-        For an element without counterpart.
+        FEBio has no such element.
     """
     kind = mesh.element_type
     if kind in NAMES:
@@ -96,20 +95,19 @@ def febio_mesh(mesh: SolidMesh) -> SolidMesh:
 
 
 def opposite_faces(mesh: SolidMesh) -> IntArray:
-    """Faces ``(f, k)`` on the other side of the leaflets than the pressure, normals outward.
+    """Faces ``(f, k)`` on the side of the leaflets opposite to the pressure, normals outward.
 
-    Those outer faces whose normal points against that of the nearest pressure face.
+    These are the outer faces whose normal is opposite to that of the nearest pressure face.
     """
+
+    def middles(faces: IntArray) -> tuple[FloatArray, FloatArray]:
+        corners = [0, 2, 8] if faces.shape[1] == 9 else [0, 1, 2]
+        a, b, c = (mesh.nodes[faces[:, i]] for i in corners)
+        normal = np.cross(b - a, c - a)
+        return (a + b + c) / 3, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
     faces = outer_faces(mesh.elements, mesh.element_type)
-    middle, normal = _middles(mesh, faces)
-    there, along = _middles(mesh, mesh.pressure_faces)
+    middle, normal = middles(faces)
+    there, along = middles(mesh.pressure_faces)
     _, near = cKDTree(there).query(middle)
     return np.asarray(faces[np.einsum("fi,fi->f", normal, along[near]) < -0.5])
-
-
-def _middles(mesh: SolidMesh, faces: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Centres and unit normals ``(f, 3)`` of faces, by three of their corners."""
-    corners = [0, 2, 8] if faces.shape[1] == 9 else [0, 1, 2]
-    a, b, c = (mesh.nodes[faces[:, i]] for i in corners)
-    normal = np.cross(b - a, c - a)
-    return (a + b + c) / 3, normal / np.linalg.norm(normal, axis=1, keepdims=True)

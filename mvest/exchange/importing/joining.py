@@ -1,15 +1,15 @@
-"""Two leaflets that were surfaced one by one, joined along their commissures to the band of a case.
+"""Join two separate leaflet surfaces along their commissures to the band of a case.
 
-Each leaflet is a disc: its boundary runs along the annulus from one commissure to the other and
-back along the free edge. At a commissure two such boundaries lie side by side for some way before
-the free edges part; a strip of triangles is laid between them there. The band is then drawn anew on
-the lines of its own coordinates, so that it has triangles of one size whatever the leaflets had.
+Each leaflet is a disc: its boundary runs along the annulus from one commissure to the other, and
+back along the free edge. At a commissure the boundaries of both leaflets run side by side before
+the free edges part; there a strip of triangles joins them. The band is then remeshed on the lines
+of its own coordinates, with triangles of equal size.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from mvest.cases.band import loop_vector_area, two_loops, without_ears
 from mvest.cases.tissue import LeafletBand
 from mvest.errors import GeometryError
+from mvest.exchange.importing.written import REGIONS
 from mvest.exchange.surfaces import Surface, merged
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import BandGrid, band_grid
@@ -28,40 +29,33 @@ from mvest.valve.geometry.thickening import smooth_vertex_normals
 from mvest.valve.geometry.triangles import areas, surface_edges
 
 COINCIDENT = 1e-6
-"""mm, below which vertices of both leaflets are one."""
-REGIONS = ("anterior", "posterior")
+"""Merge distance (mm) of the vertices of both leaflets."""
 MAX_HOLE = 0.2
-"""Of a leaflet's boundary: how long that of a hole may be, which is closed."""
+"""Largest length of a hole's boundary over that of the leaflet; such holes are closed."""
 MAX_GAP = 6.0
-"""mm between the leaflets at a commissure, and from a commissure to the leaflets."""
+"""Largest distance (mm) of the leaflets at a commissure, and of a commissure from the leaflets."""
 MAX_MISS = 8.0
-"""mm along a leaflet's boundary from where a commissure is marked to where it is."""
+"""Largest distance (mm) along a leaflet's boundary of a marked commissure from the true one."""
 CORNER, SETTLED = 3.0, 0.15
-"""mm: behind the corner the distance to the other leaflet no longer falls, by that much over that
-way."""
+"""Length (mm) behind the corner over which the distance to the other leaflet falls by at most the
+second number (mm)."""
 OPENING = 0.4
-"""mm more than at the corner, from which on two boundaries are free edges that part."""
+"""Increase of the distance (mm) over that at the corner where free edges begin to part."""
 CURL_AT, CURLED = (0.0, 0.6, 1.5, 2.5), 0.85
-"""mm from an edge: a side that curls round a rim runs otherwise within the first two than between
-the last two, by 32 degrees or more; a surface that ends there by less than 10."""
+"""Distances (mm) from an edge, and the largest cosine between the directions in the first and the
+last interval of a side that curls round a rim (32 degrees or more; other surfaces have under 10).
+"""
 RIM_ROUNDS = 2
-"""Of smoothing an edge: over one of its triangles' edges."""
+"""Rounds of smoothing of an edge."""
 MAX_SEAM = 0.25
-"""Of a free edge, from commissure to commissure: how far it may run beside the other one."""
+"""Largest share of a free edge, from commissure to commissure, that is joined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leaflet:
-    """One leaflet as a disc.
+    """One leaflet as a disc: ``(n, 3)`` mm, ``(m, 3)``, and its boundary ``(k,)``.
 
-    Attributes
-    ----------
-    vertices, triangles
-        ``(n, 3)`` mm and ``(m, 3)``.
-    loop
-        ``(k,)`` its boundary, in the direction of its triangles.
-    holes : int
-        How many were closed.
+    ``loop`` has the direction of the triangles; ``holes`` is the number of closed holes.
     """
 
     vertices: FloatArray
@@ -71,17 +65,21 @@ class Leaflet:
 
     @classmethod
     def of(cls, vertices: FloatArray, triangles: IntArray) -> Leaflet:
-        """The largest piece of a surface, with coincident vertices made one and holes closed.
+        """The largest piece of a surface, with merged vertices and closed holes.
 
         Raises
         ------
         GeometryError
-            It is closed, no manifold, or has a hole that is a second boundary.
+            It is closed, not a manifold, or has a second long boundary.
         """
         whole = merged(Surface(vertices, triangles))
         points, faces = whole.vertices, whole.triangles
         apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-        faces = _largest_piece(points, faces[apart & (areas(points, faces) > 0)])
+        faces = faces[apart & (areas(points, faces) > 0)]
+        edges, n = surface_edges(faces), len(points)
+        graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
+        piece = connected_components(graph, directed=False)[1][faces[:, 0]]
+        faces = faces[piece == np.argmax(np.bincount(piece, weights=areas(points, faces)))]
         loops = sorted(boundary_loops(faces), key=lambda loop: -loop_length(points[loop]))
         if not loops:
             raise GeometryError(
@@ -105,22 +103,15 @@ class Leaflet:
 
     @property
     def curve(self) -> FloatArray:
-        """``(k, 3)`` mm, the boundary."""
+        """The boundary, ``(k, 3)`` mm."""
         return self.vertices[self.loop]
 
-    def turned(self) -> Leaflet:
-        """The same with its triangles facing the other way."""
-        return Leaflet(self.vertices, self.triangles[:, ::-1], self.loop[::-1], self.holes)
+    def arcs(self, ends: FloatArray) -> tuple[IntArray, IntArray]:
+        """The loop between the vertices nearest to two points ``(2, 3)``, and the rest.
 
-    def arcs(self, first: FloatArray, second: FloatArray) -> tuple[IntArray, IntArray]:
-        """The loop from the vertex nearest to a point to that nearest to another, and the rest.
-
-        Both arcs have both ends.
+        Both arcs include both ends.
         """
-        curve = self.curve
-        start, stop = (
-            int(np.argmin(np.linalg.norm(curve - point, axis=1))) for point in (first, second)
-        )
+        start, stop = (int(np.argmin(np.linalg.norm(self.curve - end, axis=1))) for end in ends)
         if start == stop:
             raise GeometryError(
                 "both commissures are at the same vertex of a leaflet; are they those of this "
@@ -136,27 +127,16 @@ def loop_length(curve: FloatArray) -> float:
     return float(np.linalg.norm(curve - np.roll(curve, -1, axis=0), axis=1).sum())
 
 
-def _largest_piece(vertices: FloatArray, triangles: IntArray) -> IntArray:
-    edges = surface_edges(triangles)
-    n = len(vertices)
-    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
-    of_triangle = label[triangles[:, 0]]
-    area = np.bincount(of_triangle, weights=areas(vertices, triangles))
-    return triangles[of_triangle == np.argmax(area)]
-
-
 def commissures_on(contour: FloatArray, leaflets: Sequence[Leaflet]) -> FloatArray:
     """The two points ``(2, 3)`` of a contour where the nearer leaflet changes.
 
     Raises
     ------
     GeometryError
-        It is not near to each of the leaflets once, in one piece.
+        There are other than two changes.
     """
     distance = [_nearest(contour, leaflet.curve)[0] for leaflet in leaflets]
-    # Over as many neighbours as make a few mm, so that no single point decides.
-    difference = distance[0] - distance[1]
+    difference = distance[0] - distance[1]  # smoothed over a few mm
     width = max(1, round(0.02 * len(contour)))
     nearer = sum(np.roll(difference, k) for k in range(-width, width + 1)) < 0
     changes = np.flatnonzero(nearer != np.roll(nearer, 1))
@@ -184,23 +164,23 @@ def joined(
     Parameters
     ----------
     leaflets
+        Anterior, posterior.
     commissures
-        ``(2, 3)`` mm, where the annulus passes from one leaflet to the other.
+        ``(2, 3)`` mm.
     contour
         ``(k, 3)`` mm, closed curve along the annulus, or None.
     down
         ``(3,)`` from the annulus to the ventricle.
     seam_mm
-        Distance up to which boundaries that leave a commissure side by side are joined.
+        Largest distance of boundaries that are joined.
     edge_mm
-        Of the triangles, on average.
+        Mean edge length of the triangles.
     offset_mm
-        By which the anterior and the posterior leaflet are moved to the ventricle: half a thickness
+        Shifts of the anterior and the posterior leaflet towards the ventricle: half a thickness
         turns an atrial surface into the midsurface.
     seams : (2, 2) or None
-        Share of each leaflet's free edge (columns) that is joined at each commissure. That of
-        another frame where the valve is closed and the edges lie side by side all along; else it
-        is found.
+        Joined share of each leaflet's free edge (columns) at each commissure (rows). A closed
+        valve, whose edges touch all along, needs that of an open frame.
 
     Returns
     -------
@@ -208,12 +188,12 @@ def joined(
         Regions 0 (anterior) and 1 (posterior).
     seams : (2, 2)
     gap : float
-        mm, largest distance between the leaflets that a strip of triangles spans.
+        mm, largest width of the strips of triangles.
 
     Raises
     ------
     GeometryError
-        The commissures are not at the leaflets, what is joined is no leaflets, or the coordinates
+        The commissures are not at the leaflets, the surfaces are not leaflets, or the coordinates
         of the band fold over.
     """
     for name, leaflet in zip(REGIONS, leaflets, strict=True):
@@ -240,7 +220,7 @@ def joined(
     region = [np.full(len(own), k) for k, own in enumerate(faces)]
     edges = (arcs[1], others[1] + len(front.vertices))
     same, shares, gaps = np.arange(len(vertices)), np.zeros((2, 2)), []
-    # A free edge begins where the annulus of its leaflet ends, and there the other one ends.
+    # Where the free edge of one leaflet begins, that of the other one ends.
     for k in range(2):
         a, b = edges[k], edges[1 - k][::-1]
         given = None if seams is None else (seams[k, k], seams[k, 1 - k])
@@ -273,28 +253,29 @@ def _facing_ventricle(
     commissures: FloatArray,
     contour: FloatArray | None,
     down: FloatArray,
-    beside_mm: float,
+    seam_mm: float,
 ) -> tuple[Leaflet, IntArray, IntArray]:
     """The leaflet with its triangles facing the ventricle, its arcs of annulus and free edge."""
-    for candidate in (leaflet, leaflet.turned()):
-        arcs = candidate.arcs(commissures[0], commissures[1])
+    turned = replace(leaflet, triangles=leaflet.triangles[:, ::-1], loop=leaflet.loop[::-1])
+    for candidate in (leaflet, turned):
+        arcs = candidate.arcs(commissures)
         to = other.vertices if contour is None else contour
         away = [float(_nearest(candidate.vertices[arc], to)[0].mean()) for arc in arcs]
         # The annulus is nearer to the contour, or else farther from the other leaflet.
         annulus = arcs[int(np.argmax(away) if contour is None else np.argmin(away))]
         ring = np.vstack([candidate.vertices[annulus], other.curve.mean(0)])
         if loop_vector_area(ring) @ down > 0:
-            return candidate, *_cornered(candidate, annulus, other, beside_mm)
+            return candidate, *_cornered(candidate, annulus, other, seam_mm)
     raise GeometryError("a leaflet lies in the axis of the annulus, to neither side of the other")
 
 
 def _cornered(
-    leaflet: Leaflet, rough: IntArray, other: Leaflet, beside_mm: float
+    leaflet: Leaflet, rough: IntArray, other: Leaflet, seam_mm: float
 ) -> tuple[IntArray, IntArray]:
-    """Arcs of annulus and free edge, parted where the boundary comes to lie beside the other one.
+    """Arcs of annulus and free edge, split at the corners of the leaflet.
 
-    A commissure is marked to some mm. Along the annulus the other leaflet comes nearer up to the
-    corner; behind it the two boundaries lie beside each other.
+    Commissures are marked with errors of some mm. Along the annulus the other leaflet comes nearer
+    up to the corner, behind which the two boundaries run side by side.
     """
     middle = len(rough) // 2
     loop = np.roll(leaflet.loop, -int(np.flatnonzero(leaflet.loop == rough[middle])[0]))
@@ -308,13 +289,13 @@ def _cornered(
         along = _along(leaflet.vertices[way])
         off = np.linalg.norm(closest_on_loop(leaflet.vertices[way], other.curve)[2], axis=1)
         distance = np.where(np.abs(along - expected) <= reach, off, np.inf)
-        first = int(np.argmax(distance <= max(beside_mm, float(distance.min()))))
+        first = int(np.argmax(distance <= max(seam_mm, float(distance.min()))))
         window = (along >= along[first]) & (along <= along[first] + CORNER)
         settled = distance <= distance[window].min() + SETTLED
         ends.append(way[first + int(np.argmax(settled[first:]))])
     last, begin = (int(np.flatnonzero(loop == end)[0]) for end in ends)
     if last >= begin:
-        raise GeometryError("the two leaflets lie beside each other all along the annulus")
+        raise GeometryError("the two leaflets run side by side all along the annulus")
     return np.r_[loop[begin:], loop[: last + 1]], loop[last : begin + 1]
 
 
@@ -330,7 +311,7 @@ def _shares(curve: FloatArray) -> FloatArray:
 def _seam(
     a: FloatArray, b: FloatArray, max_mm: float, given: tuple[float, float] | None
 ) -> tuple[int, int]:
-    """How far two curves that begin beside each other are joined: last point of each, 1 or more."""
+    """Last joined points, 1 or more, of two curves that begin side by side."""
     shares = _shares(a), _shares(b)
     if given is None:
         distance, nearest = _nearest(a, b)
@@ -347,10 +328,10 @@ def _seam(
 
 
 def _strip(vertices: FloatArray, a: IntArray, b: IntArray) -> tuple[IntArray, IntArray, float]:
-    """Triangles between two rows of vertices, the row that has two corners of each, their width.
+    """Triangles between two rows of vertices, the row with two corners of each, and their width.
 
-    The first row runs as the boundary of its leaflet does, the second one against it. Of the two
-    triangles that may come next, the one with the shorter new edge is taken.
+    The first row runs along the boundary of its leaflet, the second one against it. The next
+    triangle is the one with the shorter new edge.
     """
     x, y = vertices[a], vertices[b]
     across = np.pad(np.linalg.norm(x[:, None] - y, axis=2), (0, 1), constant_values=np.inf)
@@ -374,8 +355,8 @@ def _nearest(points: FloatArray, to: FloatArray) -> tuple[FloatArray, IntArray]:
 def _drawn(
     band: LeafletBand, grid: BandGrid, columns: int, offset_mm: tuple[float, float]
 ) -> Surface:
-    """A band on the lines of its coordinates, moved off its side."""
-    # The grid's angle runs against that of the chart; both have the anterior leaflet in 0 to 180.
+    """A band remeshed on the lines of its coordinates and shifted along its normals."""
+    # The angle of the grid runs against that of the band; both have the anterior leaflet in 0-180.
     phi = np.mod(180.0 - grid.phi, 360.0)
     rows = band.position(phi, grid.s).reshape(-1, columns, 3)
     rows = _smooth_rims(_flat_part(rows, np.where(phi[:columns] < 180, *offset_mm)))
@@ -387,10 +368,10 @@ def _drawn(
 
 
 def _flat_part(rows: FloatArray, offset_mm: FloatArray) -> FloatArray:
-    """Rows ``(r, k, 3)`` of a band, drawn closer where its edges curl round the rims of leaflets.
+    """Rows ``(r, k, 3)`` of a band without edges that curl round the rims of leaflets.
 
-    A side that was cut out of a thick leaflet goes on round half of its rim, which is left out: a
-    quarter of a circle, whose radius ``(k,)`` is what the side is moved by.
+    The side of a thick leaflet includes half of its rim: a quarter of a circle, whose radius
+    ``(k,)`` is the shift of the side.
     """
     step = np.linalg.norm(np.diff(rows, axis=0), axis=2)
     along = np.vstack([np.zeros(rows.shape[1]), np.cumsum(step, axis=0)])
@@ -418,10 +399,9 @@ def _flat_part(rows: FloatArray, offset_mm: FloatArray) -> FloatArray:
 
 
 def _smooth_rims(rows: FloatArray) -> FloatArray:
-    """Rows ``(r, k, 3)`` with the first and the last curve smoothed, and those beside them less.
+    """Rows ``(r, k, 3)`` with the first and the last curve smoothed, and their neighbours less.
 
-    Where a surface was clipped its edge is as rough as its triangles, and where the free edges
-    part it has a kink that no leaflet of that thickness has.
+    A clipped edge is as rough as its triangles, and has a kink where the free edges part.
     """
     result = rows.copy()
     for end, inwards in ((0, 1), (len(rows) - 1, -1)):

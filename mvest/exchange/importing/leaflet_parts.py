@@ -12,30 +12,29 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange._images import Segment
-from mvest.exchange.surfaces import Surface, merged, part_of
+from mvest.exchange.importing.written import REGIONS
+from mvest.exchange.surfaces import Surface, merged
 from mvest.exchange.volumes import LabelMap
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.leaflet_fields import STEP_MM, inside_surfaces
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 
-REGIONS = ("anterior", "posterior")
 TERMS = {"anterior": "sh-leaflet-mv-a", "posterior": "sh-leaflet-mv-p"}
 """Codes of SlicerHeart's terminology for the leaflets of the mitral valve."""
-SCALLOPS = {"a1", "a2", "a3", "p1", "p2", "p3"}
-"""Carpentier's names of the segments of the leaflets."""
 WORDS = {
     "anterior": {"anterior", "aml", "amvl", "a1", "a2", "a3"},
     "posterior": {"posterior", "pml", "pmvl", "p1", "p2", "p3"},
 }
-"""In the names of leaflets."""
+"""Words in the names of leaflets, and of their scallops (Carpentier)."""
+SCALLOPS = {"a1", "a2", "a3", "p1", "p2", "p3"}
 OTHERS = {"papillary", "muscle", "commissure", "annulus", "chordae", "tricuspid", "aortic"}
-"""Words in the names of what is no mitral leaflet."""
+"""Words in the names of other structures."""
 VALVE_MM = (10.0, 120.0)
 """Size of a valve."""
 Content: TypeAlias = Surface | LabelMap
 Grid: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""Spacing, direction and origin of voxels, as `mvest.exchange.volumes.LabelMap` has them."""
+"""Spacing, direction and origin of voxels, as in `mvest.exchange.volumes.LabelMap`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,15 +46,15 @@ class Tissue:
     masks : (I, J, K) each
     grid : Grid
     surface : ((n, 3) mm, (m, 3)) or None
-        One closed surface of both leaflets; there are no masks then.
+        One closed surface of both leaflets, in place of masks.
     nameless : tuple of str
-        The two labels of which nothing says which leaflet they are.
+        Two labels whose names do not say which leaflet they are.
     """
 
     masks: tuple[BoolArray, ...]
     grid: Grid
-    surface: tuple[FloatArray, IntArray] | None
-    nameless: tuple[str, ...]
+    surface: tuple[FloatArray, IntArray] | None = None
+    nameless: tuple[str, ...] = ()
 
     @property
     def points(self) -> FloatArray:
@@ -85,38 +84,38 @@ def tissue_of(
     Parameters
     ----------
     contents
-        Of one file, or of those of the anterior and of the posterior leaflet.
+        Of one file, or of the files of the anterior and of the posterior leaflet.
     frame
-        Of a label map over time; None for the first one with labels. Of a layered segmentation the
-        only layer that is looked at; None for all.
+        Frame of a label map over time (None: the first with labels), or the only layer of a
+        segmentation to use (None: all).
     given
         Names or numbers of the parts of one file that are the ``anterior`` and the ``posterior``
-        leaflet, or both (``leaflets``). Else terminology and names tell them.
+        leaflet, or both (``leaflets``). By default terminology and names decide.
     scale
         mm per unit of surfaces.
     derived
-        Gets a sentence for what is used and what is not.
+        Sentences about used and unused parts are appended.
 
     Raises
     ------
     InputError, GeometryError
-        Leaflets that are not recognised, files that do not go together, surfaces in disorder.
+        Leaflets are not recognised, files do not fit each other, surfaces are defective.
     """
     chosen = [_parts(content, frame) for content in contents]
     nameless: tuple[str, ...] = ()
     if len(contents) == 1:
         chosen, nameless = _chosen(chosen[0], given, derived)
     else:
-        derived.append("each leaflet from a file of its own")
+        derived.append("each leaflet from a separate file")
     maps = [content for content in contents if isinstance(content, LabelMap)]
     if maps:
         grids = [(m.spacing, m.direction, m.origin) for m in maps]
-        alike = [np.allclose(a, b, atol=1e-3) for a, b in zip(grids[0], grids[-1], strict=True)]
-        alike += [len(maps) == len(contents), maps[0].frames.shape == maps[-1].frames.shape]
-        if not all(alike):
-            raise InputError("the two files have not the same voxels")
+        same = [np.allclose(a, b, atol=1e-3) for a, b in zip(grids[0], grids[-1], strict=True)]
+        same += [len(maps) == len(contents), maps[0].frames.shape == maps[-1].frames.shape]
+        if not all(same):
+            raise InputError("the two files do not have the same voxels")
         masks = [np.asarray(np.any([p.shape() for p in own], axis=0)) for own in chosen]
-        return Tissue(tuple(masks), grids[0], None, nameless)
+        return Tissue(tuple(masks), grids[0], nameless=nameless)
     pieces = [[_outwards(part.shape(), scale) for part in own] for own in chosen]
     whole = [piece for own in pieces for piece in own]
     size = float(np.ptp(np.concatenate([points for points, _ in whole]), axis=0).max())
@@ -126,18 +125,18 @@ def tissue_of(
             "units= right?"
         )
     if len(whole) == 1:
-        return Tissue((), (np.ones(3), np.eye(3), np.zeros(3)), whole[0], ())
+        return Tissue((), (np.ones(3), np.eye(3), np.zeros(3)), whole[0])
     inside, origin = inside_surfaces(whole, STEP_MM)
     parted = np.split(np.array(inside), np.cumsum([len(own) for own in pieces])[:-1])
     masks = [np.asarray(own.any(axis=0)) for own in parted]
-    return Tissue(tuple(masks), (np.full(3, STEP_MM), np.eye(3), origin), None, nameless)
+    return Tissue(tuple(masks), (np.full(3, STEP_MM), np.eye(3), origin), nameless=nameless)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:
-    """A segment, a label or an object, and what gives its voxels or its surface.
+    """A segment, label or object, and a function that gives its voxels or surface.
 
-    Nameless labels are called by their number.
+    Nameless labels have their number as name.
     """
 
     name: str
@@ -147,17 +146,17 @@ class _Part:
 
     @property
     def words(self) -> set[str]:
-        """The words of its name, in small letters."""
+        """Lower-case words of the name."""
         return set(re.findall(r"[a-z]+\d*", re.sub(r"([a-z])([A-Z])", r"\1 \2", self.name).lower()))
 
 
 def _parts(content: Content, frame: int | None) -> list[_Part]:
-    """The parts of a file that hold anything."""
+    """The parts of a file that are not empty."""
     if isinstance(content, Surface):
         names = sorted(set(content.groups))
         if len(names) < 2:
             return [_Part("".join(names) or "surface", "", "", lambda: content)]
-        return [_Part(name, "", "", partial(part_of, content, name)) for name in names]
+        return [_Part(name, "", "", partial(_object, content, name)) for name in names]
     filled = filled_frames(content)
     if frame not in (None, *filled):
         raise InputError(f"frame {frame} holds no labels, expected one of {filled}")
@@ -172,10 +171,17 @@ def _parts(content: Content, frame: int | None) -> list[_Part]:
     return parts
 
 
+def _object(surface: Surface, name: str) -> Surface:
+    used, triangles = np.unique(
+        surface.triangles[np.array(surface.groups) == name], return_inverse=True
+    )
+    return Surface(surface.vertices[used], triangles.reshape(-1, 3).astype(np.int64))
+
+
 def _chosen(
     parts: Sequence[_Part], given: Mapping[str, Sequence[str]], derived: list[str]
 ) -> tuple[list[list[_Part]], tuple[str, ...]]:
-    """The parts of both leaflets together or of each, and the names of two that tell nothing."""
+    """The parts of both leaflets together or of each, and the names of two nameless ones."""
     both, *chosen = (
         [_called(parts, word) for word in given.get(name, ())] for name in ("leaflets", *REGIONS)
     )
@@ -198,8 +204,8 @@ def _chosen(
     rest = [part for part in parts if not any(part in own for own in chosen)]
     if len(parts) > 1:
         names = REGIONS if len(chosen) == 2 else ("both leaflets",)
-        said = [f"{name}: {_listed(own)}" for name, own in zip(names, chosen, strict=True)]
-        derived.append("; ".join(said + [f"not used: {_listed(rest)}"] * bool(rest)))
+        words = [f"{name}: {_listed(own)}" for name, own in zip(names, chosen, strict=True)]
+        derived.append("; ".join(words + [f"not used: {_listed(rest)}"] * bool(rest)))
     return chosen, ()
 
 
@@ -219,7 +225,7 @@ def _listed(parts: Sequence[_Part]) -> str:
 
 
 def _outwards(part: Surface, scale: float) -> tuple[FloatArray, IntArray]:
-    """A closed surface in mm with its normals outwards and coincident vertices one."""
+    """A closed surface in mm with merged vertices and outward normals."""
     one = merged(Surface(scale * part.vertices, part.triangles))
     faces = one.triangles
     if enclosed_volume(one.vertices, faces) < 0:

@@ -1,4 +1,4 @@
-"""Thick leaflets as they were segmented: label maps, or closed surfaces of each or of both."""
+"""Thick segmented leaflets: label maps, or closed surfaces of each leaflet or of both."""
 
 from __future__ import annotations
 
@@ -14,14 +14,8 @@ from mvest.cases.band import LARGEST_THICKNESS
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.frames import MM_PER
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.importing.leaflet_parts import (
-    REGIONS,
-    Content,
-    Tissue,
-    filled_frames,
-    tissue_of,
-)
-from mvest.exchange.importing.written import FoundFrame, case_of_frames, check_options
+from mvest.exchange.importing.leaflet_parts import Content, Tissue, filled_frames, tissue_of
+from mvest.exchange.importing.written import REGIONS, FoundFrame, case_of_frames, check_options
 from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
 from mvest.exchange.volumes import LabelMap, read_labels
 from mvest.reading.text import named
@@ -39,51 +33,56 @@ from mvest.valve.geometry.segmented import (
 )
 
 OBSERVER_MM, CORRELATED_MM = 1.0, 10.0
-"""Standard deviation of the wall that a person or a network draws, and the length along the
-leaflets over which such errors are correlated: the values of a case that states none."""
+"""Standard deviation of walls drawn by a person or a network, and the length along the leaflets
+over which these errors are correlated: the values of a case that states none."""
+BLUR_VOXELS = 0.5
+"""Standard deviation of the smoothing of voxels."""
 CLOSED_AT = 0.35
 """s after the open frame, in a generic cardiac cycle."""
 
 
 @dataclass(frozen=True, slots=True)
 class LeafletsOptions:
-    """What a label map or surfaces do not say.
+    """What a label map or surfaces do not state.
 
     Attributes
     ----------
     anterior, posterior : name, number or file, or list of names and numbers
         Segments, labels or objects of a leaflet (``anterior=2``, ``posterior=[P1,P2,P3]``), or its
-        file. Else SlicerHeart's terminology, names or, of two nameless labels, the anatomy.
+        file. By default SlicerHeart's terminology and the names decide; of two nameless labels the
+        taller leaflet is the anterior one.
     leaflets : name or number, or list of them
-        What both leaflets are together.
+        Both leaflets together.
     open, closed : number, file, or list of two files
-        Frames of a map over time, or layers of a segmentation; the closed frame may be another
-        file, or the files of its anterior and of its posterior leaflet.
+        Frames of a map over time, or layers of a segmentation. The closed frame may be another
+        file, or the files of its anterior and posterior leaflet.
     units : str or None
-        Of lengths in surfaces and of the points given here: mm, cm or m. Maps are in mm.
+        Unit of surfaces and of points given here: mm, cm or m. Maps are in mm.
     tips, tips_closed : tuple of float or None
         Papillary tips, antero-lateral and postero-medial: six numbers, LPS.
     muscles : list of two names or files
-        Papillary muscles in the same order, from whose shape the tips follow.
+        Papillary muscles in the same order; their shapes give the tips.
     commissures, anterior_point : tuple of float or None
-        Six numbers, and a point of the anterior annulus, of leaflets that are one label or surface.
-        Else these are shortest at the commissures, and the anterior one is the taller one.
+        Six numbers, and a point of the anterior annulus, for leaflets that are one label or
+        surface. By default the commissures are where the leaflets are shortest, and the anterior
+        leaflet is the taller one.
     pressure_mmHg : float or None
         Transmitral pressure on the closed valve.
-    thickness_mm, thickness_range_mm : tuple of float or None
-        Thickness of the anterior and of the posterior leaflet instead of that between the walls;
-        the smallest and the largest one that is kept.
+    thickness_mm : tuple of float or None
+        Thickness of the anterior and the posterior leaflet, instead of that between the walls.
+    thickness_range_mm : tuple of float or None
+        Smallest and largest thickness; others are clipped.
     seam_mm : tuple of float or None
-        How far down from the annulus the leaflets are one piece at the two commissures, where the
-        open frame does not show it.
+        Lengths from the annulus down the two commissures over which the leaflets are one piece, if
+        the open frame does not show them.
     edge_mm : float
-        Of the triangles of the case.
-    blur_voxels, smoothing_mm : float
-        Standard deviations of the smoothing of voxels, and of the midsurface round the valve.
+        Edge length of the triangles of the case.
+    smoothing_mm : float
+        Standard deviation of the smoothing of the midsurface round the valve.
     observer_mm : float
-        Standard deviation of where the walls were drawn; 0 for a voxelised model.
+        Standard deviation of the drawn walls; 0 for a voxelised model.
     mirrored : bool
-        Take the valve although it lies as in a mirror.
+        Accept a valve that is its own mirror image.
     """
 
     anterior: Any = None
@@ -102,7 +101,6 @@ class LeafletsOptions:
     thickness_range_mm: tuple[float, ...] | None = None
     seam_mm: tuple[float, ...] | None = None
     edge_mm: float = 1.2
-    blur_voxels: float = 0.5
     smoothing_mm: float = 0.0
     observer_mm: float = OBSERVER_MM
     mirrored: bool = False
@@ -110,8 +108,8 @@ class LeafletsOptions:
     def __post_init__(self) -> None:
         counts = dict.fromkeys(("tips", "tips_closed", "commissures"), 6) | {"anterior_point": 3}
         pairs = ("muscles", "thickness_mm", "thickness_range_mm", "seam_mm")
-        limits = {"edge_mm": (0.3, 5), "blur_voxels": (0, 2), "smoothing_mm": (0, 10)}
-        check_options(self, counts | dict.fromkeys(pairs, 2), limits | {"observer_mm": (0, 5)})
+        limits = {"edge_mm": (0.3, 5), "smoothing_mm": (0, 10), "observer_mm": (0, 5)}
+        check_options(self, counts | dict.fromkeys(pairs, 2), limits)
 
     def words(self, name: str) -> tuple[str, ...]:
         """Names, numbers or files of an option that is one or a list of them."""
@@ -121,7 +119,7 @@ class LeafletsOptions:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class _Seen:
     """A frame: its role, its file or the files of both leaflets, and its number there."""
 
     role: Role
@@ -137,31 +135,31 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     ----------
     source : Path
         Label map (NRRD, ``.seg.nrrd``, NIfTI, MetaImage; LPS as the file states it) or closed
-        surfaces (STL, PLY, OBJ, GLB, VTK). If its name says ``anterior``, the file beside it that
-        says ``posterior`` is the other leaflet, and the other way round.
+        surfaces (STL, PLY, OBJ, GLB, VTK). For a file whose name has ``anterior``, the other
+        leaflet is the file with ``posterior`` in its place, and vice versa.
     options : LeafletsOptions
 
     Raises
     ------
     InputError, GeometryError
-        In one line what is missing, by the name of its option, or wrong: leaflets that are not
-        recognised, with holes, in pieces, open, that meet nowhere, or without an orifice.
+        An option is missing (named in the message); leaflets are not recognised, have holes, are in
+        pieces, open, apart, or without an orifice.
     """
     derived: list[str] = []
     frames: list[FoundFrame] = []
     with named(source):
-        seen = _seen(source, options, derived)
+        seen = _frames(source, options, derived)
         scale = _scale(seen[0].contents[0], options)
     anterior, commissures = (
         None if at is None else scale * np.squeeze(np.reshape(at, (-1, 3)))
         for at in (options.anterior_point, options.commissures)
     )
     known: dict[str, Any] = {"commissures": commissures, "edge_mm": options.edge_mm}
+    given = {name: options.words(name) for name in ("leaflets", *REGIONS)}
     seams: Any = options.seam_mm
     exchanged, voxel = False, 0.0
     for one in seen:
         with named(*one.files):
-            given = {name: options.words(name) for name in ("leaflets", *REGIONS)}
             tissue = tissue_of(one.contents, one.frame, given, scale, derived)
             stated = options.tips_closed if frames else options.tips
             if stated is not None:
@@ -171,7 +169,7 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
             known |= {"tips": tips, "anterior": anterior}
             if tissue.surface is None:
                 voxel = float(np.prod(tissue.grid[0]) ** (1 / 3))
-                how = {"blur": options.blur_voxels, "seams": seams}
+                how = {"blur": BLUR_VOXELS, "seams": seams}
                 surface, seams = masks_midsurface(tissue.masks, tissue.grid, **how, **known)
             else:
                 surface = midsurface(*tissue.surface, **known)
@@ -179,7 +177,7 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
             if not frames and (tissue.nameless or (anterior is None and len(tissue.masks) < 2)):
                 exchanged = _posterior_first(surface, tissue.nameless, derived)
             surface = surface.exchanged() if exchanged and tissue.nameless else surface
-            check_tips_of(surface, tips, handedness=not options.mirrored)
+            check_tips_of(surface, tips, handedness=False)  # `case_of_frames` checks the sides
             surface = _thick(surface, options, derived)
             surface, done = without_crossings(
                 surface, options.smoothing_mm, thickened=one.role is Role.REFERENCE
@@ -192,22 +190,21 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     if len(frames) > 1:
         derived.append(f"time of the closed frame: {CLOSED_AT:g} s of a generic cardiac cycle")
         if options.tips_closed is None:
-            derived.append("papillary tips of the closed frame: where they are in the open one")
-    std = segmentation_std(voxel, options.blur_voxels * voxel, options.observer_mm)
+            derived.append("papillary tips of the closed frame: those of the open frame")
+    std = segmentation_std(voxel, BLUR_VOXELS * voxel, options.observer_mm)
     correlated = CORRELATED_MM if options.observer_mm > 0 else 2 * BEND_MM
     derived.append(
         f"observation: {std:.3g} mm by voxels, smoothing and observer_mm={options.observer_mm:g}, "
         f"correlated over {correlated:g} mm"
     )
     document = {
-        "name": "segmented valve",  # names of files may be those of patients
-        "regions": list(REGIONS),
+        "name": "segmented valve",  # file names may be names of patients
         "thickness": {"point_data": "thickness"},
         "observation": {"std_mm": std, "correlation_length_mm": correlated},
         "derived": derived,
     }
     with named(source):
-        return case_of_frames(frames, document)
+        return case_of_frames(frames, document, mirrored=options.mirrored)
 
 
 def _read(files: tuple[Path, ...]) -> tuple[Content, ...]:
@@ -218,13 +215,13 @@ def _read(files: tuple[Path, ...]) -> tuple[Content, ...]:
 
 
 def _paired(source: Path) -> tuple[Path, ...]:
-    """A file, or those of the anterior and of the posterior leaflet beside each other."""
+    """A file, or those of the anterior and the posterior leaflet next to each other."""
     pair = [source.with_name(re.sub("|".join(REGIONS), name, source.name)) for name in REGIONS]
     return tuple(pair) if pair[0] != pair[1] and all(p.is_file() for p in pair) else (source,)
 
 
 def _scale(content: Content, options: LeafletsOptions) -> float:
-    """Millimetres per unit of a source and of what the options state."""
+    """Millimetres per unit of a source and of points in the options."""
     if isinstance(content, LabelMap) and options.units not in (None, "mm"):
         raise InputError(f"units={options.units}, but a label map is in mm")
     if not isinstance(content, LabelMap) and options.units not in MM_PER:
@@ -232,7 +229,7 @@ def _scale(content: Content, options: LeafletsOptions) -> float:
     return MM_PER[options.units or "mm"]
 
 
-def _seen(source: Path, options: LeafletsOptions, derived: list[str]) -> list[Seen]:
+def _frames(source: Path, options: LeafletsOptions, derived: list[str]) -> list[_Seen]:
     """The open frame, and the closed one if there is one."""
     anterior, posterior, closed = map(options.words, (*REGIONS, "closed"))
     if len(posterior) == 1 and Path(*posterior).is_file():
@@ -241,7 +238,7 @@ def _seen(source: Path, options: LeafletsOptions, derived: list[str]) -> list[Se
         files = (source,) if anterior or posterior or options.leaflets else _paired(source)
     if closed and options.pressure_mmHg is None:
         raise InputError("no pressure of the closed frame; give pressure_mmHg=...")
-    opened = Seen(Role.REFERENCE, files, _read(files), options.open)
+    opened = _Seen(Role.REFERENCE, files, _read(files), options.open)
     content, number = opened.contents[0], None
     if isinstance(content, LabelMap):
         number = int(*closed) if len(closed) == 1 and closed[0].isdecimal() else None
@@ -266,14 +263,14 @@ def _seen(source: Path, options: LeafletsOptions, derived: list[str]) -> list[Se
         return [opened]
     files = _paired(Path(*closed)) if len(closed) == 1 else tuple(map(Path, closed))
     with named(*files):
-        shut = Seen(Role.CLOSED, files, _read(files), None)
+        shut = _Seen(Role.CLOSED, files, _read(files), None)
         if type(shut.contents[0]) is not type(content):
-            raise InputError("a label map beside surfaces, expected both frames of one kind")
+            raise InputError("one frame is a label map, the other surfaces; expected one kind")
     return [opened, shut]
 
 
 def _tips(
-    seen: Seen, tissue: Tissue, options: LeafletsOptions, scale: float, derived: list[str]
+    seen: _Seen, tissue: Tissue, options: LeafletsOptions, scale: float, derived: list[str]
 ) -> FloatArray:
     """Papillary tips ``(2, 3)`` mm from the muscles."""
     if options.muscles is None:
@@ -285,30 +282,29 @@ def _tips(
     for word in options.muscles:
         own = Path(word).is_file()
         contents = _read((Path(word),)) if own else seen.contents[:1]
-        named = {} if own else {"leaflets": (word,)}
-        muscle = tissue_of(contents, seen.frame, named, scale, [])
+        muscle = tissue_of(contents, seen.frame, {} if own else {"leaflets": (word,)}, scale, [])
         tips.append(papillary_tip(muscle.points, tissue.points))
     return np.stack(tips)
 
 
 def _posterior_first(surface: Midsurface, nameless: Sequence[str], derived: list[str]) -> bool:
-    """Whether the second of two leaflets is the anterior one, which is the taller one."""
+    """Whether the second of two leaflets is the taller and so the anterior one."""
     heights = surface.heights
-    said = f"{heights.max():.1f} mm tall, the other {heights.min():.1f} mm"
+    sizes = f"{heights.max():.1f} mm tall, the other {heights.min():.1f} mm"
     if heights.max() < TALLER * heights.min():
         options = "anterior=N posterior=N" if nameless else "anterior_point=[x,y,z]"
-        raise InputError(f"which leaflet is the anterior one? one is {said}; give {options}")
+        raise InputError(f"which leaflet is the anterior one? one is {sizes}; give {options}")
     second = bool(heights[1] > heights[0])
     if nameless:
         derived.append(
             f"{nameless[second]} taken as the anterior and {nameless[not second]} as the posterior "
-            f"leaflet: it is {said}, and on the anterior side of the tips"
+            f"leaflet: it is {sizes}, and on the anterior side of the tips"
         )
     return second
 
 
 def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) -> Midsurface:
-    """The same with the thickness that is stated, that of the posterior leaflet on their border."""
+    """The surface with the stated thickness, and within the stated limits."""
     thickness = surface.thickness
     if options.thickness_mm is not None:
         of_vertex = np.ones(len(thickness), dtype=np.int64)
@@ -325,6 +321,6 @@ def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) ->
     if thickness.max() > LARGEST_THICKNESS:
         raise GeometryError(
             f"thickness of {thickness.max():.1f} mm, expected at most {LARGEST_THICKNESS:g} mm of "
-            "leaflets; thickness_range_mm=[LOW,HIGH] keeps it between two"
+            "leaflets; thickness_range_mm=[LOW,HIGH] limits it"
         )
     return replace(surface, thickness=thickness)

@@ -8,73 +8,70 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
-from mvest.cases.band import two_loops
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.tissue import FAMILIES, GENERIC_THICKNESS
+from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import InputError
-from mvest.exchange.importing.joining import REGIONS, Leaflet, commissures_on, joined
+from mvest.exchange.importing.joining import Leaflet, commissures_on, joined
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
-from mvest.exchange.importing.written import FoundFrame, case_of_frames, check_options
+from mvest.exchange.importing.written import (
+    REGIONS,
+    FoundFrame,
+    case_of_frames,
+    check_options,
+    check_sides,
+)
 from mvest.exchange.markups import TO_LPS
 from mvest.reading.text import named
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.dimensions import ChordLayout
 
 OPEN, CLOSED = ("MD", "ED", "CD"), ("MS", "ES", "CS")
-"""Phases in the order in which they are preferred."""
+"""Phases in the order of preference."""
 TIMES = {"MS": 0.3, "CS": 0.4, "ES": 0.5}
 """s after the open phase, in the order of a cardiac cycle."""
 GENERIC_PRESSURE = 110.0
 """mmHg on the closed valve: ventricle less atrium from mid to end of systole."""
 CORRELATED_MM = 10.0
-"""Along the leaflets, over which errors of a segmentation are correlated."""
+"""Correlation length along the leaflets of errors of a segmentation."""
 MAX_RMS = 4.0
-"""mm between the annulus and the leaflets' edges, beyond which they are not of one valve."""
-MARGINAL_MM = 4.0
-"""From the free edge, within which a chord inserts as marginal ones do."""
-MAX_AWAY = 3.0
-"""mm from where a chord begins to its papillary tip."""
+"""Largest rms distance (mm) of the annulus from the edges of the leaflets."""
 
 _Seen: TypeAlias = tuple[SeenPhase, Role]
 
 
 @dataclass(frozen=True, slots=True)
 class SlicerheartOptions:
-    """What a folder of SlicerHeart does not say.
+    """What a folder of SlicerHeart does not state.
 
     Attributes
     ----------
     scene : str or None
-        Whose files are taken where a folder holds those of several.
+        Which scene to take, if the folder holds several.
     only : str or None
-        What the names of surfaces must hold, where there are several of one leaflet.
+        Word in the names of surfaces, if there are several of one leaflet.
     open, closed : str or None
-        Phase (MD, ED, MS, ES, ...) of the reference and of the closed frame; MD, ED, CD and MS,
-        ES, CS in this order if not given. For folders of ValveFemExport, which name no phase,
-        ``closed`` is the folder with the closed valve.
+        Phase (MD, ED, MS, ES, ...) of the reference and of the closed frame; by default the first
+        of MD, ED, CD and of MS, ES, CS. If file names have no phases, ``closed`` is the folder of
+        the closed valve.
     tips, tips_closed : tuple of float or None
         Papillary tips, antero-lateral and postero-medial: six numbers, LPS mm; ``tips_closed``
-        those of the closed frame where it has others.
+        those of the closed frame.
     pressure_mmHg : float or None
-        Transmitral pressure on the closed valve; 110 mmHg assumed.
+        Transmitral pressure on the closed valve; 110 mmHg by default.
     thickness_mm : tuple of float or None
-        Of the anterior and the posterior leaflet; generic values if not given.
+        Of the anterior and the posterior leaflet; generic by default.
     midsurface : bool
-        Whether the surfaces are midsurfaces already; those of ValveBatchExport are atrial ones, and
-        are moved to the ventricle by half the thickness, as those of ValveFemExport are, whose
-        shells follow the side that is met first.
+        Whether the surfaces are midsurfaces. By default they are atrial sides, and are moved
+        towards the ventricle by half the thickness.
     edge_mm : float
-        Of the triangles of the case.
+        Edge length of the triangles of the case.
     seam_mm : float
-        Up to which distance the leaflets are joined where they part at a commissure.
+        Largest distance over which the leaflets are joined at a commissure.
     std_mm : float or None
-        Standard deviation of a coordinate of the surfaces; 1 mm assumed.
+        Standard deviation of a coordinate of the surfaces; 1 mm by default.
     mirrored : bool
-        Take the valve although its landmarks lie as in a mirror.
+        Accept a valve that is its own mirror image.
     """
 
     scene: str | None = None
@@ -104,43 +101,40 @@ class SlicerheartOptions:
 def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     """A case of a folder that SlicerHeart's ValveBatchExport or ValveFemExport wrote.
 
-    An open phase becomes the reference, a closed one the closed frame, another closed one is held
-    out. Leaflets, which are separate surfaces there, are joined along the commissures.
+    An open phase becomes the reference, a closed one the closed frame, a further closed one is held
+    out. The leaflets are separate surfaces there, and are joined along the commissures.
 
     Parameters
     ----------
     source
-        The folder of one scene, with ``*_atrial_*.vtk`` and, if they were exported,
+        The folder of one scene, with ``*_atrial_*.vtk`` and, if exported,
         ``AnnulusContourPoints.csv``, ``ValveLandmarkPoints.csv`` and ``*_landmarks.fcsv``;
-        papillary muscles are lists of points whose file names say so (``PapillaryMarkup-...``).
+        papillary muscles are lists of points in files named ``PapillaryMarkup-...``.
     options
 
     Raises
     ------
     InputError, GeometryError
-        What is missing, by the name of its option; damaged files, axes that contradict each other.
+        An option is missing (named in the message), files are damaged or contradict each other.
     """
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; expected one that SlicerHeart wrote")
     derived: list[str] = []
     with named(source):
-        chosen = _chosen(source, options, derived)
-        frames = _frames(chosen, options, derived)
-        chordae = _chordae(chosen[0][0], frames[0], derived)
+        frames = _frames(_chosen(source, options, derived), options, derived)
         std, known = options.std_mm, {"correlation_length_mm": CORRELATED_MM}
         document = {
             "name": "valve from SlicerHeart",  # names of files and scenes may be those of patients
             "source": "SlicerHeart",
-            "regions": list(REGIONS),
             "thickness": dict(zip(REGIONS, map(float, options.thickness), strict=True)),
             **({} if std is None else {"observation": {"std_mm": std, **known}}),
             "derived": derived,
         }
-        return case_of_frames(frames, document, chordae)
+        return case_of_frames(frames, document, mirrored=options.mirrored)
 
 
 def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> list[_Seen]:
-    """The phases that are taken, in the order of time."""
+    """The phases to import, in the order of time."""
     by_phase = read_folder(source, options.scene, options.only)
     closed = options.closed
     if closed is not None and Path(closed).is_dir():
@@ -163,7 +157,7 @@ def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> li
     if closed is not None:
         roles[closed] = Role.CLOSED
     if left := [p for p in by_phase if p not in roles]:
-        derived.append(f"phases {', '.join(left)} not taken")
+        derived.append(f"phases {', '.join(left)} not used")
     order = sorted(roles, key=lambda p: (roles[p] is not Role.REFERENCE, TIMES.get(p, 0.6)))
     return [(by_phase[p], roles[p]) for p in order]
 
@@ -171,7 +165,7 @@ def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> li
 def _frames(
     chosen: Sequence[_Seen], options: SlicerheartOptions, derived: list[str]
 ) -> list[FoundFrame]:
-    """The frames with their leaflets made one, in the order of time."""
+    """The frames with joined leaflets, in the order of time."""
     frames: list[FoundFrame] = []
     pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
     offset, seams = (0.0, 0.0), None
@@ -192,7 +186,7 @@ def _frames(
         with named(label):
             tips = _tips_of(seen, role, options, frames, notes)
             leaflets, commissures, down = _placed(seen, tips, options.mirrored, notes)
-            # The closed edges lie side by side all along: joined as far as the open ones.
+            # The closed edges touch all along: they are joined as far as the open ones.
             surface, seams, gap = joined(
                 leaflets,
                 commissures,
@@ -214,9 +208,7 @@ def _frames(
             at, load = max(frames[-1].time + 0.01, TIMES.get(seen.phase, 0.6)), pressure
         name = PHASES.get(seen.phase, label)
         frames.append(FoundFrame(name, role, at, load, surface, tips))
-    derived.append(
-        f"surfaces drawn anew on the lines of their coordinates, edges about {options.edge_mm:g} mm"
-    )
+    derived.append(f"surfaces remeshed with edges of about {options.edge_mm:g} mm")
     if len(frames) > 1:
         derived.append("times: by the order of the phases in a generic cardiac cycle")
         if options.pressure_mmHg is None:
@@ -234,28 +226,29 @@ def _tips_of(
     before: Sequence[FoundFrame],
     notes: list[str],
 ) -> FloatArray:
-    """Papillary tips ``(t, 3)`` mm of a phase, in the order of those of the first frame."""
+    """Papillary tips ``(2, 3)`` mm of a phase."""
     given = {Role.REFERENCE: options.tips, Role.CLOSED: options.tips_closed}.get(role)
     if given is not None:
         return np.array(given, dtype=np.float64).reshape(2, 3)
     if seen.tips is None and before:
-        notes.append(f"papillary tips where they are in {before[0].name}")
+        notes.append(f"papillary tips of {before[0].name}")
         return before[0].tips
     if seen.tips is None:
         raise InputError(
             "no papillary tips (lists of points PapillaryMarkup-antero-lateral and -postero-medial"
             ", with base, tip and insertion); give tips=[x,y,z,x,y,z] in LPS mm"
         )
-    if before and len(seen.tips) == len(before[0].tips):
-        return seen.tips[linear_sum_assignment(cdist(before[0].tips, seen.tips))[1]]
     return seen.tips
 
 
 def _placed(
     seen: SeenPhase, tips: FloatArray, mirrored: bool, notes: list[str]
 ) -> tuple[list[Leaflet], FloatArray, FloatArray]:
-    """Leaflets, commissures ``(2, 3)`` mm, and the direction ``(3,)`` to the ventricle."""
-    leaflets = []
+    """Leaflets, commissures ``(2, 3)`` mm, and the direction ``(3,)`` to the ventricle.
+
+    The annulus must lie at the leaflets, and landmarks must not be mirrored.
+    """
+    leaflets, marks = [], seen.landmarks
     for name, (vertices, triangles) in zip(REGIONS, seen.leaflets, strict=True):
         with named(f"{name} leaflet"):
             leaflets.append(Leaflet.of(vertices, triangles))
@@ -263,9 +256,26 @@ def _placed(
             notes.append(f"{name} leaflet: {leaflets[-1].holes} holes closed")
     edges = np.concatenate([leaflet.curve for leaflet in leaflets])
     down = tips.mean(axis=0) - edges.mean(axis=0)
-    _check_axes(seen, edges, down, mirrored)
-    if {"ALC", "PMC"} <= set(seen.landmarks):
-        commissures = np.stack([seen.landmarks["ALC"], seen.landmarks["PMC"]])
+    if seen.contour is not None:
+        away, turned = (
+            float(np.sqrt(np.mean(np.square(cKDTree(edges).query(seen.contour * axes)[0]))))
+            for axes in (TO_LPS["LPS"], TO_LPS["RAS"])
+        )
+        if away > MAX_RMS:
+            hint = (
+                f" (with x and y turned it would be {turned:.1f} mm: one of them is in RAS where "
+                "LPS is stated, or the other way round)"
+            )
+            raise InputError(
+                f"the annulus lies {away:.1f} mm from the leaflets, expected at most {MAX_RMS:g} mm"
+                f"{hint if turned < MAX_RMS else ''}"
+            )
+    for left, right in (("ALC", "PMC"), ("AL", "PM")):
+        if not mirrored and {"A", "P", left, right} <= set(marks):
+            to_left, to_front = marks[left] - marks[right], marks["A"] - marks["P"]
+            check_sides(f"landmark {left}", to_left, to_front, down)
+    if {"ALC", "PMC"} <= set(marks):
+        commissures = np.stack([marks["ALC"], marks["PMC"]])
     elif seen.contour is not None:
         commissures = commissures_on(seen.contour, leaflets)
         notes.append("commissures where the leaflet nearer to the annulus changes")
@@ -275,66 +285,3 @@ def _placed(
             "AnnulusContourPoints.csv"
         )
     return leaflets, commissures, down
-
-
-def _check_axes(seen: SeenPhase, edges: FloatArray, down: FloatArray, mirrored: bool) -> None:
-    """Raise where tables and surfaces have other axes, or the valve is its own mirror image."""
-    if seen.contour is not None and (away := _rms(seen.contour, edges)) > MAX_RMS:
-        other = _rms(seen.contour * TO_LPS["RAS"], edges)
-        hint = (
-            f" (with x and y turned it would be {other:.1f} mm: one of them is in RAS where LPS is "
-            "stated, or the other way round)"
-        )
-        raise InputError(
-            f"the annulus lies {away:.1f} mm from the leaflets, expected at most {MAX_RMS:g} mm"
-            f"{hint if other < MAX_RMS else ''}"
-        )
-    marks = seen.landmarks
-    for left, right in (("ALC", "PMC"), ("AL", "PM")):
-        if not mirrored and {"A", "P", left, right} <= set(marks):
-            sides = np.stack([marks[left] - marks[right], marks["A"] - marks["P"], down])
-            # From the atrium the antero-lateral commissure is on the left of the anterior leaflet.
-            if np.linalg.det(sides) < 0:
-                raise InputError(
-                    f"the landmarks A, P, {left} and {right} lie as in a mirror: from the atrium "
-                    f"{left} is on the right; is one axis turned? (mirrored=true takes it so)"
-                )
-
-
-def _rms(points: FloatArray, edges: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(cKDTree(edges).query(points)[0]))))
-
-
-def _chordae(
-    seen: SeenPhase, reference: FoundFrame, derived: list[str]
-) -> list[tuple[object, ...]]:
-    """Rows of the table of chordae; none if the export has none.
-
-    Raises
-    ------
-    InputError
-        Chords begin elsewhere than at the tips.
-    """
-    if not len(seen.chords):
-        return []
-    reach = cdist(seen.chords[:, 0], reference.tips)
-    if (away := reach.min(axis=1).max()) > MAX_AWAY:
-        raise InputError(
-            f"chords begin up to {away:.1f} mm from the papillary tips, expected {MAX_AWAY:g} mm"
-        )
-    vertices, insertion = reference.surface.vertices, seen.chords[:, 1]
-    loops = [vertices[loop] for loop in two_loops(vertices, reference.surface.triangles)]
-    edge = min(loops, key=lambda curve: _rms(curve, reference.tips))
-    basal = np.where(cKDTree(edge).query(insertion)[0] > MARGINAL_MM, 1, 0)
-    # As stiff together as the template's, of which there may be fewer.
-    template, count = ChordLayout(), np.bincount(basal, minlength=2)
-    marginal = len(template.marginal_phi) * template.marginal_stiffness
-    both = np.array([marginal, len(template.basal) * template.basal_stiffness])
-    stiffness = 2 * both / np.maximum(count, 1)
-    derived.append(
-        f"chordae: {len(basal)} of the export, as long as there; the {count[0]} within "
-        f"{MARGINAL_MM:g} mm of the free edge are marginal; as stiff together as the template's"
-    )
-    names = np.array(FAMILIES)[basal]
-    columns = (reach.argmin(axis=1), *insertion.T, names, seen.chord_lengths, stiffness[basal])
-    return list(zip(*(column.tolist() for column in columns), strict=True))

@@ -1,11 +1,11 @@
-"""Folders of SlicerHeart: what each file is, by the words of its name.
+"""Folders of SlicerHeart: the words of a file's name say what it holds.
 
 ValveBatchExport begins every name with ``SCENE_VALVE_frame_N_PHASE`` (``ValveBatchExportRules/
-base.py``). What follows changed over the months: leaflet surfaces were ``mitral_anterior_leaflet``
-from April 2026, ``atrial_mitral_anterior_leaflet`` from August 2026, when the former became the
-name of closed surfaces of segments. ValveFemExport, and people who save models one by one, name
-neither scene nor phase. Models are in the axes that they name (``SPACE=LPS``; without it RAS, as
-before Slicer 4.11), tables in R, A, S of the same origin. Everything is LPS in mm here.
+base.py``). The rest has changed: leaflet surfaces were ``mitral_anterior_leaflet`` in April 2026,
+and ``atrial_mitral_anterior_leaflet`` from August 2026, when the former became the name of closed
+surfaces of segments. ValveFemExport, and models saved by hand, name neither scene nor phase. Models
+have the axes that they name (``SPACE=LPS``), or RAS as before Slicer 4.11; tables have R, A, S of
+the same origin. Here everything is LPS in mm.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from mvest.errors import GeometryError, InputError
+from mvest.exchange.importing.written import REGIONS
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
-from mvest.exchange.surfaces import SURFACE_SUFFIXES, Surface, read_mesh
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_mesh
 from mvest.reading.text import numbers, one_line, read_columns
 from mvest.typing import FloatArray, IntArray
 
@@ -37,23 +36,23 @@ PHASES = {
     "UN": "unknown",
     **{f"P{k}": f"custom{k}" for k in range(1, 5)},
 }
-"""Names of the phases by what file names and tables call them (``HeartValveLib/Constants.py``)."""
+"""Phases by their abbreviations in file names and tables (``HeartValveLib/Constants.py``)."""
 _NAME = re.compile(
     r"(?P<scene>.+?)_(?P<valve>mitral|tricuspid|aortic|pulmonary|cavc|lavv|unknown|\S+ \w+ valve)"
     rf"(?:_frame_(?P<frame>\d{{1,6}}))?_(?P<phase>{'|'.join(PHASES)})(?:_(?P<again>\d+))?"
     r"(?:_(?P<rest>.+))?"
 )
 _PHASE = re.compile(r"(?:.*[^A-Za-z0-9])?(?P<phase>[MEC][DS])(?:[^A-Za-z0-9].*)?")
-"""In names of other kinds, where CT is a modality and P1 a scallop."""
+"""In other names, where CT is a modality and P1 a scallop."""
 LEAFLETS = {"anterior": {"anterior", "aml", "amvl"}, "posterior": {"posterior", "pml", "pmvl"}}
 MUSCLES = (
     ({"antero", "lateral"}, {"anterolateral"}, {"al"}),
     ({"postero", "medial"}, {"posteromedial"}, {"pm"}),
 )
-"""Words of the two papillary muscles, in the order of a case's tips."""
+"""Words of the papillary muscles, in the order of the tips of a case."""
 PAPILLARY = {"papillary", "muscle", "muscles", "tip", "tips"}
-CHORDS, ANNULUS, MARKS = {"chords", "chordae"}, {"annulus"}, {"landmarks", "labels"}
-NO_LEAFLET = PAPILLARY | CHORDS | ANNULUS | {"ventricular"}
+ANNULUS, MARKS = {"annulus"}, {"landmarks", "labels"}
+NO_LEAFLET = PAPILLARY | ANNULUS | {"ventricular", "chords", "chordae"}
 LANDMARKS = ("A", "P", "AL", "PM", "ALC", "PMC")
 _COMMON = ("Filename", "Phase", "FrameNumber", "Valve")
 _TABLES = {
@@ -66,12 +65,12 @@ MAX_FILES = 20_000
 
 
 def words_of(name: str) -> set[str]:
-    """Words of a name, also of one like ``AnnulusContour``, in lower case."""
+    """Lower-case words of a name, also of one like ``AnnulusContour``."""
     return {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)}
 
 
 class _File:
-    """A file, the words of its name, and what `_NAME` finds in it; empty where it does not."""
+    """A file with the words of its name, and the groups of `_NAME` (empty if it does not match)."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -86,7 +85,7 @@ class _File:
         self.leaflet = "" if len(named) != 1 or self.words & NO_LEAFLET else named[0]
 
     def fits(self, other: _File) -> bool:
-        """Whether it is of the scene, the frame and the phase of a surface, as far as it says."""
+        """Whether its name contradicts neither scene, frame nor phase of a surface."""
         pairs = ((self.scene, other.scene), (self.frame, other.frame))
         named = self.valve.lower() in ("", "mitral") and self.phase in ("", other.phase)
         return named and all(a == b or not a or not b for a, b in pairs)
@@ -99,7 +98,7 @@ class SeenPhase:
     Attributes
     ----------
     phase : str
-        Key of `PHASES`; empty where the export names none.
+        Key of `PHASES`; empty if the export names none.
     leaflets
         Vertices ``(n, 3)`` mm and triangles ``(m, 3)``: anterior, posterior.
     contour
@@ -107,14 +106,9 @@ class SeenPhase:
     landmarks
         ``(3,)`` mm by label, of `LANDMARKS`.
     tips
-        ``(2, 3)`` mm, antero-lateral and postero-medial; or ``(t, 3)`` where chords begin, from
-        left to right; or None.
-    chords
-        ``(c, 2, 3)`` mm, from where each begins to where it ends on a leaflet.
-    chord_lengths
-        ``(c,)`` mm along the lines.
+        ``(2, 3)`` mm, antero-lateral and postero-medial; or None.
     notes
-        What was assumed in reading, and what was not used.
+        Assumptions, and what was not used.
     """
 
     phase: str
@@ -122,29 +116,27 @@ class SeenPhase:
     contour: FloatArray | None
     landmarks: dict[str, FloatArray]
     tips: FloatArray | None
-    chords: FloatArray
-    chord_lengths: FloatArray
     notes: tuple[str, ...]
 
 
 def read_folder(
     folder: Path, scene: str | None = None, only: str | None = None
 ) -> dict[str, SeenPhase]:
-    """Every phase of the mitral valve of one scene by its name; ValveFemExport gives it none.
+    """All phases of the mitral valve of one scene, by their abbreviations or an empty name.
 
     Parameters
     ----------
     folder
     scene
-        Whose files are taken where there are those of several.
+        Which one, if there are several.
     only
-        What the names of surfaces must hold, where there are several of one leaflet.
+        Word in the names of surfaces, if there are several of a leaflet.
 
     Raises
     ------
     InputError, GeometryError
-        No leaflets of a mitral valve, several scenes, several surfaces of a leaflet, a damaged
-        file.
+        There are no mitral leaflets, several scenes, or several surfaces of a leaflet; a file is
+        damaged.
     """
     paths = sorted(islice(folder.rglob("*"), MAX_FILES + 1))
     if len(paths) > MAX_FILES:
@@ -168,38 +160,33 @@ def read_folder(
         raise InputError(
             f"{folder}: {len(scenes)} scenes ({', '.join(scenes[:5])}); give scene=NAME"
         )
-    named = [phase for phase in PHASES if any(f.phase == phase for f in chosen)]
+    phases = [phase for phase in PHASES if any(f.phase == phase for f in chosen)]
     seen = {
-        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], models, lists)
-        for phase in named or [""]
+        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], lists)
+        for phase in phases or [""]
     }
-    if named and not all(f.phase for f in chosen):
-        first = seen[named[0]]
+    if phases and not all(f.phase for f in chosen):
+        first = seen[phases[0]]
         notes = (*first.notes, "surfaces that name no phase not used")
-        seen[named[0]] = replace(first, notes=notes)
+        seen[phases[0]] = replace(first, notes=notes)
     return seen
 
 
-def _read_phase(
-    folder: Path, mine: Sequence[_File], models: Sequence[_File], lists: Sequence[_File]
-) -> SeenPhase:
-    """What there is of the phase that some surfaces of leaflets are of."""
+def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> SeenPhase:
+    """The phase of some surfaces of leaflets."""
     notes: list[str] = []
     this = min(mine, key=lambda f: int(f.frame or -1))
     if len(frames := sorted({f.frame for f in mine})) > 1:
         notes.append(f"frame {this.frame} taken of frames {', '.join(frames)} of this phase")
     mine = [f for f in mine if f.frame == this.frame]
-    surfaces = tuple(_leaflet(folder, mine, name, notes) for name in LEAFLETS)
-    beside = [f for f in models if f.phase == this.phase and f.fits(this) and not f.leaflet]
+    surfaces = tuple(_leaflet(folder, mine, name, notes) for name in REGIONS)
     places = (this.path.parent, folder, folder.parent)
     labels, contour = _table("AnnulusContourPoints.csv", places, this)
-    named, points = _table("ValveLandmarkPoints.csv", places, this)
-    landmarks = dict(zip((*labels, *named), (*contour, *points), strict=True))
+    names, points = _table("ValveLandmarkPoints.csv", places, this)
+    landmarks = dict(zip((*labels, *names), (*contour, *points), strict=True))
     curves = [contour]
-    if len(contour) < MIN_CONTOUR:
-        curves += [_middle_of_tube(f, notes) for f in beside if f.words & ANNULUS]
     tips: dict[int, FloatArray] = {}
-    # Those of this phase last, so that they stand before those that name no phase.
+    # Lists that name this phase come last and override those that name none.
     for file in sorted((f for f in lists if f.fits(this)), key=lambda f: bool(f.phase)):
         for name, item in read_markups(file.path).items():
             words = file.words | words_of(name)
@@ -218,11 +205,6 @@ def _read_phase(
                 notes.append(f"{item.kind} of {len(item.labels)} points ({listed}) not used")
             if item.unplaced:
                 notes.append(f"points {', '.join(item.unplaced)} not placed, so not used")
-    chords, lengths = _chords([_model(f, notes) for f in beside if f.words & CHORDS])
-    begins = np.unique(chords[:, 0], axis=0)
-    # Fewer than there are chords, or these run the other way.
-    if len(tips) < 2 <= len(begins) < len(chords):
-        tips = dict(enumerate(begins[::-1]))  # the left one is the antero-lateral one
     known = {label.strip().upper(): point for label, point in landmarks.items()}
     if unused := known.keys() - {"", *LANDMARKS}:
         notes.append(f"landmarks {', '.join(sorted(unused))} not used")
@@ -231,9 +213,7 @@ def _read_phase(
         surfaces,
         next((curve for curve in curves if len(curve) >= MIN_CONTOUR), None),
         {label: known[label] for label in LANDMARKS if label in known},
-        np.stack([tips[k] for k in range(len(tips))]) if len(tips) > 1 else None,
-        chords,
-        lengths,
+        np.stack([tips[k] for k in range(2)]) if len(tips) == 2 else None,
         tuple(dict.fromkeys(one_line(note) for note in notes)),
     )
 
@@ -241,11 +221,11 @@ def _read_phase(
 def _leaflet(
     folder: Path, files: Sequence[_File], name: str, notes: list[str]
 ) -> tuple[FloatArray, IntArray]:
-    """The surface of a leaflet: the atrial side before others, a fitted shell before its model."""
+    """The surface of a leaflet; atrial sides and fitted shells come first."""
     fitting = [f for f in files if f.leaflet == name]
     for better in ("atrial", "fit"):
         fitting = [f for f in fitting if better in f.words] or fitting
-    # A second valve model of the same frame has a number behind its phase.
+    # Further valve models of a frame have a number behind the phase.
     fitting = [f for f in fitting if not f.again] or fitting
     if len(fitting) != 1:
         listed = one_line(", ".join(f.path.name for f in fitting or files), 150)
@@ -253,22 +233,16 @@ def _leaflet(
             f"{folder}: {len(fitting)} surfaces of the {name} leaflet ({listed}), expected one; "
             "only=WORD takes those with a word in their names"
         )
-    surface = _model(fitting[0], notes)
+    surface = read_mesh(fitting[0].path)
     if not len(surface.triangles):
         raise GeometryError(f"{fitting[0].path}: no triangles; expected a surface")
-    return surface.vertices, surface.triangles
-
-
-def _model(file: _File, notes: list[str]) -> Surface:
-    """A model with its points in LPS."""
-    model = read_mesh(file.path)
-    if model.space is None:
+    if surface.space is None:
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
-    return replace(model, vertices=model.vertices * TO_LPS[model.space or "RAS"])
+    return surface.vertices * TO_LPS[surface.space or "RAS"], surface.triangles
 
 
 def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:
-    """Labels and positions ``(r, 3)`` of one frame, of a table in the first place that has it."""
+    """Labels and positions ``(r, 3)`` mm of one frame, from the first place that has the table."""
     label, position = _TABLES[name]
     file = next((place / name for place in places if (place / name).is_file()), None)
     if file is None:
@@ -286,15 +260,15 @@ def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], F
 
 
 def _muscle(words: set[str]) -> int | None:
-    """Which papillary muscle some words name, if they name one."""
+    """Which papillary muscle some words name, if any."""
     found = [k for k, names in enumerate(MUSCLES) if any(name <= words for name in names)]
     return found[0] if len(found) == 1 else None
 
 
 def _tips_in(file: Path, words: set[str], item: PointList) -> dict[int, FloatArray]:
-    """Tips by muscle: of a list of one muscle, or of points that are labelled with theirs.
+    """Tips by muscle, from the list of one muscle or from points labelled with their muscles.
 
-    A list of one has base, tip and insertion (``PAPILLARY_MUSCLE_POINT_LABELS``).
+    The list of one has base, tip and insertion (``PAPILLARY_MUSCLE_POINT_LABELS``).
     """
     muscle = _muscle(words)
     if muscle is None:
@@ -307,41 +281,3 @@ def _tips_in(file: Path, words: set[str], item: PointList) -> dict[int, FloatArr
             "insertion"
         )
     return {muscle: item.points[tip[0] if tip else 1]}
-
-
-def _chords(models: Sequence[Surface]) -> tuple[FloatArray, FloatArray]:
-    """Chords of models of lines, ``(c, 2, 3)`` mm, and their lengths ``(c,)`` mm along these.
-
-    Lines run from the papillary muscles to the leaflets, and a branch begins where its trunk ends.
-    A chord begins where no line ends. Each line that ends where none begins is the end of one;
-    lines with the same ends count once.
-    """
-    parts = [model.vertices[model.segments] for model in models]
-    points = np.concatenate([np.zeros((0, 2, 3)), *parts]).reshape(-1, 3)
-    rounded = np.round(points, 3)  # of text have six digits
-    _, first, number = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    pairs = np.unique(number.reshape(-1, 2), axis=0)
-    begin, end = pairs[pairs[:, 0] != pairs[:, 1]].T
-    length = np.linalg.norm(points[first[end]] - points[first[begin]], axis=1)
-    roots, last = np.setdiff1d(begin, end), ~np.isin(end, begin)
-    if not len(roots):
-        return np.zeros((0, 2, 3)), np.zeros(0)
-    graph = csr_matrix((length, (begin, end)), shape=(len(first), len(first)))
-    way = dijkstra(graph, indices=roots)[:, begin[last]] + length[last]
-    root, line = np.nonzero(np.isfinite(way))
-    chords = points[first[np.column_stack([roots[root], end[last][line]])]]
-    return chords, way[root, line]
-
-
-def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:
-    """The curve in the middle of a tube whose points are rings one after another."""
-    points = _model(file, notes).vertices
-    for sides in range(3, 101):
-        if len(points) % sides or len(points) // sides < 8:
-            continue
-        rings = points.reshape(-1, sides, 3)
-        middle = rings.mean(axis=1)
-        radius = np.linalg.norm(rings - middle[:, None], axis=2)
-        if np.ptp(radius) < 0.05 * radius.mean():
-            return middle
-    raise GeometryError(f"{file.path}: {len(points)} points, expected the tube of the annulus")

@@ -1,4 +1,7 @@
-"""A case from frames that an importer found: written as a folder and read by the usual rules."""
+"""What all importers share: checks of options, sides and frames, and the case itself.
+
+A case is written as a folder and read by the usual rules.
+"""
 
 from __future__ import annotations
 
@@ -13,24 +16,25 @@ import yaml
 
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
+from mvest.cases.plausibility import implausible_values
 from mvest.cases.schema import CASE_FILE
-from mvest.cases.tissue import CHORD_COLUMNS, FAMILIES
 from mvest.errors import InputError, MvestError
 from mvest.exchange.surfaces import Surface, write_surface
-from mvest.reading.text import write_columns
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface
+
+REGIONS = ("anterior", "posterior")
 
 
 def check_options(
     options: object, counts: Mapping[str, int], limits: Mapping[str, tuple[float, float]]
 ) -> None:
-    """Check the options that are lists of so many entries, or numbers within limits.
+    """Check the lengths of options that are lists, and the limits of numbers.
 
     Raises
     ------
     InputError
-        One has another length, a number that is not finite, or is beyond its limits.
+        Another length, a number that is not finite, or a value beyond its limits.
     """
     for name, count in counts.items():
         given = getattr(options, name)
@@ -44,9 +48,32 @@ def check_options(
             raise InputError(f"{name}={value}, expected {low:g} to {high:g}")
 
 
+def check_sides(left: str, to_left: FloatArray, to_front: FloatArray, down: FloatArray) -> None:
+    """Refuse a valve that is its own mirror image.
+
+    Parameters
+    ----------
+    left : str
+        What must lie on the left of the anterior leaflet, seen from the atrium.
+    to_left, to_front, down : (3,) ndarray
+        Directions: to it, to the anterior leaflet, and to the ventricle.
+
+    Raises
+    ------
+    InputError
+        It lies on the right.
+    """
+    if np.linalg.det(np.stack([to_left, to_front, down])) < 0:
+        raise InputError(
+            f"{left} lies as in a mirror: on the right of the anterior leaflet, seen from the "
+            "atrium; are tips or leaflets exchanged, or is an axis turned? (mirrored=true skips "
+            "this check)"
+        )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundFrame:
-    """A frame, in mm, mmHg and s; see ``frames`` of a case for what its fields mean."""
+    """A frame in mm, mmHg and s; for its fields see ``frames`` of a case."""
 
     name: str
     role: Role
@@ -60,24 +87,32 @@ class FoundFrame:
 def case_of_frames(
     frames: Sequence[FoundFrame],
     document: Mapping[str, Any],
-    chordae: Sequence[Sequence[object]] = (),
+    *,
+    mirrored: bool,
 ) -> ValveCase:
-    """The case of frames without common vertices, with the checks and rules of every case.
+    """The case of frames without common vertices, with the checks of every case.
 
     Parameters
     ----------
     frames
-        The reference and others.
+        The reference and others, of an anterior (region 0) and a posterior leaflet (1).
     document
         Further fields of ``case.yaml``.
-    chordae
-        Rows of a table with `CHORD_COLUMNS`; without any, chordae are laid out.
+    mirrored
+        Whether to accept a valve that is its own mirror image.
 
     Raises
     ------
     InputError, GeometryError
-        As `mvest.cases.folder.read_case`, without the name of a folder.
+        As `mvest.cases.folder.read_case`; the valve is mirrored, or the frames are exchanged.
     """
+    for one in frames:
+        x, faces, region = one.surface.vertices, one.surface.triangles, one.surface.region
+        if not mirrored:
+            front, back = (x[faces[region == k]].mean(axis=(0, 1)) for k in (0, 1))
+            down = one.tips.mean(axis=0) - x.mean(axis=0)
+            tip = f"{one.name}: the antero-lateral (first) papillary tip"
+            check_sides(tip, one.tips[0] - one.tips[1], front - back, down)
     with tempfile.TemporaryDirectory() as temporary:
         folder, entries = Path(temporary), []
         for number, one in enumerate(frames):
@@ -90,16 +125,17 @@ def case_of_frames(
             entry |= {"surface": f"{number}.vtp", "papillary_tips": one.tips.tolist()}
             apart = {} if one.role is Role.REFERENCE else {"corresponds": False}
             entries.append(entry | {"pressure": float(one.pressure)} | apart)
-        if chordae:
-            write_columns(folder / "chordae.csv", CHORD_COLUMNS, chordae)
-            table = {"file": "chordae.csv", "families": list(FAMILIES)}
-            document = {**document, "chordae": table}
         units = {"length": "mm", "pressure": "mmHg", "time": "s"}
-        whole = {"version": 1, "units": units, **document, "frames": entries}
+        regions = {"version": 1, "units": units, "regions": list(REGIONS)}
+        whole = {**regions, **document, "frames": entries}
         text = yaml.safe_dump(whole, sort_keys=False, allow_unicode=True)
         (folder / CASE_FILE).write_text(text, encoding="utf-8")
         try:
-            return replace(read_case(folder), sha256="")
+            case = replace(read_case(folder), sha256="")
         except MvestError as fault:
-            said = str(fault).replace(f"{folder / CASE_FILE}: ", "").replace(f"{folder}/", "")
-            raise type(fault)(said) from fault
+            reason = str(fault).replace(f"{folder / CASE_FILE}: ", "").replace(f"{folder}/", "")
+            raise type(fault)(reason) from fault
+    for value in implausible_values(case):
+        if value.mistake and value.field == "frames":
+            raise InputError(str(value))
+    return case

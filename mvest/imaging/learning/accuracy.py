@@ -57,12 +57,11 @@ def correlogram(errors: FloatArray, points: FloatArray) -> tuple[FloatArray, Flo
 
 def fitted_length(distance: FloatArray, correlation: FloatArray) -> float:
     """The length (mm) of the Matérn correlation nearest to a correlogram (least squares)."""
-
-    def miss(log_length: float) -> float:
-        return float(((matern(distance, np.exp(log_length)) - correlation) ** 2).sum())
-
-    low, high = np.log(LENGTHS_MM)
-    best = minimize_scalar(miss, bounds=(low, high), method="bounded")
+    best = minimize_scalar(
+        lambda log: float(((matern(distance, np.exp(log)) - correlation) ** 2).sum()),
+        bounds=tuple(np.log(LENGTHS_MM)),
+        method="bounded",
+    )
     return float(np.exp(best.x))
 
 

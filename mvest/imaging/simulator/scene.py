@@ -103,7 +103,10 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
     body[..., 0] = axis[0] + half[0] * radial * np.cos(angle)
     body[..., 1] = axis[1] + half[1] * radial * np.sin(angle)
     body[..., 2] = axis[2] - length * np.sin(psi)
-    body += (_step(u / 0.2) * _rough(rng, len(angle)))[..., None] * outward
+    # Form and trabeculae.
+    fine = waves(rng, ROWS, len(angle), 4, 0.3)
+    rough = 1.2 * waves(rng, ROWS, len(angle)) + rng.uniform(0.2, 0.6) * fine
+    body += (_step(u / 0.2) * rough)[..., None] * outward
     outflow = np.exp(-((np.abs(phi - 90.0) / rng.uniform(50, 60)) ** 4))[:, None]
     base = ring + 1.0 * outward + outflow * (2 * radius + 1.0) * forward
     fade = (1 - _step(u / 0.22))[..., None]
@@ -128,12 +131,6 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
         fat,
         outflow[:, 0],
     )
-
-
-def _rough(rng: np.random.Generator, columns: int) -> FloatArray:
-    """Offset ``(ROWS, columns)`` mm of the ventricle's inner surface: form and trabeculae."""
-    fine = waves(rng, ROWS, columns, 4, 0.3)
-    return np.asarray(1.2 * waves(rng, ROWS, columns) + rng.uniform(0.2, 0.6) * fine)
 
 
 def _shift(annulus: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-r"""Chordae as tension-only cables, the elastic hinge that holds the annulus, and ties.
+r"""Chordae as tension-only cables, the elastic hinge of the annulus, and ties.
 
 A cable runs from a prescribed papillary tip to a patch of the leaflet (a weighted average of
 material points). With strain :math:`e = L/L_0 - 1` and toe strain :math:`e_t` its force is
@@ -8,19 +8,18 @@ material points). With strain :math:`e = L/L_0 - 1` and toe strain :math:`e_t` i
         e^3/e_t^2 - e^4/(2 e_t^3) & 0 < e < e_t \\
         e - e_t/2 & e \ge e_t \end{cases}
 
-which is twice continuously differentiable: value, slope and curvature agree at both ends of the toe
-(at :math:`e_t`: value :math:`e_t/2`, slope 1, curvature 0).
+which is twice continuously differentiable (at :math:`e_t`: value :math:`e_t/2`, slope 1, curvature
+0).
 
-Ties are stiff springs between pairs of material points, such as an edge-to-edge clip makes.
-
-A pair with its points at :math:`x_1, x_2` is held at the distance :math:`L` by the energy
+Ties are stiff springs between pairs of material points, as in an edge-to-edge clip. A pair at
+:math:`x_1, x_2` is held at the distance :math:`L` by the energy
 :math:`\tfrac{k}{2} (|d| - L)^2` of :math:`d = x_1 - x_2`. With :math:`n = d/|d|`
 
 .. math::
     f = k (|d| - L) n, \qquad
     \partial f / \partial d = k \, [n n^T + (1 - L/|d|) (I - n n^T)] .
 
-The points stay free to turn about each other. With :math:`L = 0` the spring is linear.
+The points can rotate about each other freely. With :math:`L = 0` the spring is linear.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class Cables:
         ``(c,)`` mm and N.
     toe_strain : float
     families : mapping
-        Name -> ``(c,)`` bool, which cables belong to it.
+        Name -> ``(c,)`` bool, the cables that belong to it.
     """
 
     patches: Embedding
@@ -68,7 +67,7 @@ class Cables:
     families: Mapping[str, BoolArray] = field(default_factory=dict)
 
     def members(self, part: str) -> BoolArray:
-        """Which cables ``(c,)`` a family or papillary tip (``tip0``, ...) has; empty: all.
+        """Cables ``(c,)`` of a family or papillary tip (``tip0``, ...); all if ``part`` is empty.
 
         Raises
         ------
@@ -84,14 +83,9 @@ class Cables:
         return parts[part]
 
     def factor(self, kind: str, values: Mapping[str, float]) -> FloatArray:
-        """Factor ``(c,)`` of each cable: the product of what is called ``kind`` or ``kind.PART``.
+        """Factor ``(c,)`` of each cable: the product of the values of ``kind`` and ``kind.PART``.
 
-        Parameters
-        ----------
-        kind : str
-            ``chord_stiffness`` or ``chord_rest_length``.
-        values : mapping
-            Parameter -> value; others are passed over.
+        ``kind`` is ``chord_stiffness`` or ``chord_rest_length``; other parameters are ignored.
         """
         out = np.ones(len(self.rest_length))
         for name, value in values.items():
@@ -114,7 +108,7 @@ class Cables:
         stiffness_factor: float | FloatArray,
         length_factor: float | FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Force on the leaflet end, its stiffness, and its derivatives by its two factors.
+        """Force on the leaflet end, its stiffness, and its derivatives by both factors.
 
         Returns
         -------
@@ -147,9 +141,8 @@ class Cables:
 class Hinge:
     """Elastic support of material points: ``k |x - target|^2 / 2`` per point.
 
-    With thickness-averaged points it is a hinge (rotation about the annulus stays free); with
-    points on both faces it is a clamp. The stiffness is chosen so high that the support moves by
-    micrometres.
+    Thickness-averaged points make a hinge (rotation about the annulus is free), points on both
+    faces a clamp. The stiffness is so high that the support moves by micrometres only.
 
     Attributes
     ----------
@@ -174,14 +167,14 @@ class Hinge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TiedPoints:
-    """Pairs of material points and how they are tied, whatever the mesh.
+    """Pairs of tied material points, independent of the mesh.
 
     Attributes
     ----------
     first, second : ndarray
         ``(k, 3)`` mm, in the reference frame.
     length : float
-        mm, distance at which a pair is held once the valve is closed.
+        mm, distance of each pair in the closed valve.
     stiffness : float
         N/mm of each pair.
     """
@@ -217,12 +210,12 @@ class Ties:
     Attributes
     ----------
     spans : Embedding
-        ``(k,)`` vectors from the second point of each pair to the first: sums over nodes like any
-        embedding, except that the weights of a row sum to zero.
+        ``(k,)`` vectors from the second point of each pair to the first; the weights of a row sum
+        to zero.
     stiffness : float
         N/mm of each pair.
     closed_length : float
-        mm, length without force in the closed valve; at any instant it is part of the loads.
+        mm, force-free length in the closed valve; the loads hold the current one.
     """
 
     spans: Embedding
@@ -241,7 +234,7 @@ class Ties:
         x : ndarray
             ``(n, 3)`` mm.
         length : ndarray
-            ``(k,)`` mm at which the springs are without force.
+            ``(k,)`` mm, force-free lengths.
 
         Returns
         -------

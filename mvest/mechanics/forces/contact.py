@@ -1,15 +1,15 @@
 r"""Leaflet contact as a smooth non-local potential between midsurface points.
 
-The leaflets touch when their midsurfaces are one thickness apart. Contact therefore acts between
-material points of the midsurface and needs no projections, normals or facets: with area weights
+Leaflets touch when their midsurfaces are one thickness apart. Contact therefore acts between
+material points of the midsurface, without projections, normals or facets. With area weights
 :math:`a_i` the energy is
 
 .. math:: \Pi = \sum_{i<j} a_i a_j \, \varphi_{ij}(|x_i - x_j|) ,
 
-a quadrature of a double surface integral, as smooth in the positions as :math:`\varphi` is. The
-kernel is derived from the law that one wants: two parallel sheets at distance d with the potential
-:math:`\varphi` press on each other with :math:`p(d) = 2 \pi d \varphi(d)` (differentiate
-:math:`2\pi\int_d^h \varphi(r) r dr`, the energy per area). Hence
+a quadrature of a double surface integral, as smooth in the positions as :math:`\varphi`. The kernel
+follows from the contact pressure: two parallel sheets at the distance d press on each other with
+:math:`p(d) = 2 \pi d \varphi(d)` (the derivative of the energy per area
+:math:`2\pi\int_d^h \varphi(r) r dr`). Hence
 
 .. math::
     \varphi(r) = \frac{p(r)}{2 \pi r}, \qquad
@@ -17,20 +17,20 @@ kernel is derived from the law that one wants: two parallel sheets at distance d
     \quad (r_b < r < h), \qquad 0 \quad (r \ge h),
 
 three times continuously differentiable at the activation distance h. The contact pressure is
-:math:`p_0` exactly at the midsurface distance :math:`r_0`, and a barrier at :math:`r_b` keeps any
-two points apart however concentrated the load (a free edge pressed into the other leaflet). Because
-the sheets stay a thickness apart, the sum over points spaced by s approaches the integral
-exponentially, with an error of the order :math:`e^{-2\pi r_0/s}` (Poisson summation), so the
-points' pattern is not felt.
+:math:`p_0` at the midsurface distance :math:`r_0`. A barrier at :math:`r_b` keeps two points apart
+even under concentrated loads, such as a free edge pressed into the other leaflet. Because the
+sheets stay a thickness apart, the sum over points with the spacing s converges exponentially to the
+integral, with an error of the order :math:`e^{-2\pi r_0/s}` (Poisson summation): the pattern of the
+points has no effect.
 
-Distances scale with the local thickness t (mean of the two points): :math:`r_0 = c_0 t`, :math:`h =
+Distances scale with the local thickness t (mean of both points): :math:`r_0 = c_0 t`, :math:`h =
 c_h t`, :math:`r_b = 0.85 r_0`; with :math:`r_b \ge t` the thick leaflets cannot overlap. Neighbours
-on the same sheet must not repel each other: the reach of a pair is shortened to ``NEIGHBOUR * D``
-(:mod:`mvest.mechanics.forces.pair_search`) where D is its distance at rest, so that no pair is
-active in the stress-free state and the same rule serves pleats, commissures and leaflets alike.
+in one sheet must not repel each other: the reach of a pair is at most ``NEIGHBOUR * D``
+(:mod:`mvest.mechanics.forces.pair_search`), where D is its distance at rest. No pair is active in
+the stress-free state, and pleats, commissures and leaflets follow one rule.
 
-No passing: no Newton step takes from a known pair more than three quarters of its distance to the
-barrier, nor the triangulated midsurface samples through each other
+Leaflets do not pass through each other: in one Newton step a listed pair loses at most three
+quarters of its distance to the barrier, and the triangulated midsurface samples do not collide
 (:mod:`mvest.mechanics.forces.pair_search`).
 """
 
@@ -55,7 +55,7 @@ from mvest.valve.mesh.solid_mesh import Embedding
 BARRIER = 0.85
 """Distance of the barrier over the reference distance."""
 APPROACH = 0.75
-"""A pair may lose at most this share of its distance to the barrier in one Newton step."""
+"""Largest share of its distance to the barrier that a pair may lose in one Newton step."""
 
 
 class Contact:
@@ -73,14 +73,8 @@ class Contact:
         ``(t, 3)`` of the points, for the intersection check.
     settings : ContactSettings
     skin : float
-        mm by which the candidate search exceeds the reach.
+        mm by which the search radius exceeds the reach.
 
-    Attributes
-    ----------
-    sheet : Sheet
-        The points as kernels read them.
-    passing : Passing
-        Whether sheets pass through each other.
     """
 
     def __init__(
@@ -111,17 +105,11 @@ class Contact:
         self.passing = Passing(self.sheet, triangles, skin)
 
     def search(self, y: FloatArray) -> ContactPairs:
-        """Pairs that can become active while no point moves by more than half the skin.
-
-        Parameters
-        ----------
-        y : ndarray
-            ``(k, 3)`` current positions of the points.
-        """
+        """Pairs that may become active while no point ``y (k, 3)`` moves by half the skin."""
         return search_pairs(y, self.sheet, self.skin)
 
     def stale(self, pairs: ContactPairs, y: FloatArray) -> bool:
-        """Whether a point has moved so far that the search must be repeated."""
+        """Whether points have moved so far that the search must be repeated."""
         moved = np.max(np.sum((y - pairs.positions) ** 2, axis=1), initial=0.0)
         return bool(moved > (0.5 * self.skin) ** 2)
 
@@ -137,10 +125,10 @@ class Contact:
         areas: FloatArray | None,
         thickness: FloatArray | None,
     ) -> FloatArray:
-        """Change ``(k, 3)`` N of the forces at fixed positions if the sheets change at rest.
+        """Change ``(k, 3)`` N of the forces at fixed positions, due to changes at rest.
 
-        The force of a pair is a function of r and h that is homogeneous of degree -2, since r_0 is
-        a fixed part of h: its derivative by h follows from that by r (Euler).
+        The force of a pair is homogeneous of degree -2 in r and h, since r_0 is a fixed share of h;
+        its derivative by h follows from that by r (Euler).
 
         Parameters
         ----------
@@ -149,15 +137,13 @@ class Contact:
         moved : ndarray
             ``(k, 3)`` mm, displacement at rest.
         areas, thickness : ndarray or None
-            ``(k,)`` changes of them, mm^2 and mm.
+            ``(k,)`` changes in mm² and mm.
         """
-        none = np.zeros(len(y))
-        d_areas = none if areas is None else areas
-        d_thickness = none if thickness is None else thickness
-        return _forces_change(y, pairs, self.sheet, moved, d_areas, d_thickness)
+        areas, thickness = (np.zeros(len(y)) if v is None else v for v in (areas, thickness))
+        return _forces_change(y, pairs, self.sheet, moved, areas, thickness)
 
     def touching(self, pairs: ContactPairs, y: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Groups ``(g,)`` with a pair whose distance is below ``1 + margin`` times its reach."""
+        """Groups ``(g,)`` with a pair closer than ``1 + margin`` times its reach."""
         return _touching(y, pairs, margin)
 
     def add_tangent(
@@ -176,22 +162,20 @@ class Contact:
         slot : ndarray
             ``(g,)`` entry of ``between`` for each group, -1 for groups that do not touch.
         between : ndarray
-            ``(slots, w, w)`` positions of the blocks (host 1, host 2), as
-            :meth:`mvest.mechanics.assembly.SparsityPattern.between` gives them.
+            ``(slots, w, w)`` positions of the blocks (host 1, host 2) from
+            :meth:`mvest.mechanics.assembly.SparsityPattern.between`.
         own : ndarray
-            ``(e, w, w)`` positions of the blocks of each host element with itself, negative where
-            the mirror image serves.
+            ``(e, w, w)`` positions of the blocks of each host element with itself, negative in the
+            lower triangle.
         """
         _add_tangent(y, pairs, self.sheet, self.points.weights, data, slot, between, own)
 
     def largest_step(
         self, pairs: ContactPairs, y: FloatArray, dy: FloatArray, *, detect: bool = False
     ) -> float:
-        """Largest factor <= 1 on the move ``dy (k, 3)`` that takes no sheet through another.
+        """Largest factor <= 1 on the move ``dy (k, 3)`` without a collision; 0 if sheets touch now.
 
-        Zero if sheets touch before the move.
-
-        With ``detect`` collisions are looked for even where distances exclude them.
+        With ``detect`` the collision detection always runs.
         """
         factor = float(_largest_step(y, dy, pairs))
         return factor * self.passing.free_share(pairs, y, factor * dy, detect=detect)
@@ -293,8 +277,8 @@ def _add_tangent(
     n, n_w = weights.shape
     first, start, reach, areas = pairs.first, pairs.start, pairs.reach, sheet.areas
     host, by_host = sheet.host, sheet.by_host
-    # The 3x3 block of a pair is symmetric: 00, 11, 22, 12, 02, 01. Components come first, so that
-    # the innermost loops run along the nodes.
+    # The 3x3 block of a pair is symmetric: 00, 11, 22, 12, 02, 01. Components come first: innermost
+    # loops run along the nodes.
     at_point = np.zeros((n, 6))
     stiffness = np.empty(6)
     row = np.empty((6, n_w))
@@ -305,7 +289,7 @@ def _add_tangent(
         block[:] = 0.0
         k = start[g]
         while k < start[g + 1]:
-            # All pairs of one first point: collect sum_j K_ij w_j, then expand by w_i once.
+            # For all pairs of one first point: sum up K_ij w_j over j, then expand by w_i once.
             i = first[k]
             any_active = False
             while k < start[g + 1] and first[k] == i:
@@ -410,7 +394,7 @@ def _largest_step(y: FloatArray, dy: FloatArray, pairs: ContactPairs) -> float:
         rr, rd, dd = approaching(y, dy, pairs.first[k], pairs.second[k])
         if rd >= 0.0:
             continue
-        # Pairs still apart may come to the reference distance; close ones lose APPROACH.
+        # Distant pairs may close up to the reference distance; near ones lose APPROACH.
         reference = pairs.reference[k]
         barrier = BARRIER * reference
         floor = min(barrier + (1.0 - APPROACH) * (np.sqrt(rr) - barrier), reference) ** 2

@@ -1,18 +1,16 @@
-"""Which points of a sampled surface can come into contact, and whether sheets pass each other.
+"""Search for pairs of points that may come into contact, and collisions of sampled sheets.
 
-Points are searched over cubes of space. That sheets do not pass through each other is proved of
-distances, or detected.
+Points are searched in cubes of space. That a step does not move triangles of the sampled midsurface
+through each other is proved from distances of points or, failing that, checked by continuous
+collision detection (Li et al. 2020, ACM Trans. Graph. 39(4):49; IPC toolkit).
 
-That no step takes triangles of the sampled midsurface through each other mostly follows from how
-far apart the points stay. Where an edge of length a meets one of length b, or a point a triangle
-whose edges are at most a long, the average of the squared distances of the ends, weighted by where
-the meeting lies, is at most :math:`(a^2 + b^2)/4` or :math:`a^2/3`: two points are at least so
-near. The length of an edge is convex along a step, so that its ends bound it. Listed pairs are
-looked at one by one; those that the search has left out are apart by its skin, less what points
-have moved since. Where this proves nothing, continuous collision detection decides (Li et al. 2020,
-ACM Trans. Graph. 39(4):49, by the IPC toolkit). Neighbours within the sheet always are too near for
-the proof, and no time step is accepted whose triangles intersect: it is repeated with detection
-throughout.
+The proof: if an edge of length a meets one of length b, or a point meets a triangle with edges up
+to a, the weighted mean of the squared distances between their ends is at most
+:math:`(a^2 + b^2)/4` or :math:`a^2/3`. So two points are at least that close. Edge lengths are
+convex along a step, so their values at both ends bound them. Listed pairs are tested one by one;
+pairs that the search left out are farther apart than its skin, less the moves since. Neighbours
+within the sheet are always too close for the proof. No time step is accepted if triangles
+intersect: it is repeated with detection throughout.
 """
 
 from __future__ import annotations
@@ -29,15 +27,15 @@ from scipy.spatial import cKDTree
 from mvest.typing import FloatArray, IntArray
 
 NEIGHBOUR = 0.8
-"""Reach of a pair over its rest distance, at most: a sheet touches itself from 20 % compression."""
+"""Largest reach of a pair over its rest distance: sheets touch themselves from 20 % compression."""
 FINENESS = 2
-"""Cubes along the search radius: smaller ones enclose the sphere of that radius more closely."""
+"""Cubes along the search radius; smaller cubes fit the search sphere more closely."""
 EXPECTED = 72
-"""Pairs of a point for which there is room at first."""
+"""Pairs per point for which memory is allocated at first."""
 
 
 class Sheet(NamedTuple):
-    """The sampled midsurface, as kernels read it.
+    """The sampled midsurface as input of the kernels.
 
     Attributes
     ----------
@@ -46,7 +44,7 @@ class Sheet(NamedTuple):
     areas, thickness : ndarray
         ``(k,)`` mm^2 and mm.
     host, by_host : ndarray
-        ``(k,)`` the element that hosts each point, and the points in the order of their hosts.
+        ``(k,)`` host element of each point, and the points sorted by their hosts.
     activation, distance : float
         Activation and reference distance over the thickness.
     pressure : float
@@ -64,22 +62,20 @@ class Sheet(NamedTuple):
 
 
 class ContactPairs(NamedTuple):
-    """Candidate pairs sorted by the elements that host them.
+    """Candidate pairs sorted by their host elements.
 
     Attributes
     ----------
     first, second : ndarray
-        ``(p,)`` points; the host of ``first`` is not behind the host of ``second``.
-    reach : ndarray
-        ``(p,)`` activation distance of each pair, mm.
-    reference : ndarray
-        ``(p,)`` reference distance of each pair, mm.
+        ``(p,)`` points, with ``host[first] <= host[second]``.
+    reach, reference : ndarray
+        ``(p,)`` activation and reference distance of each pair, mm.
     start : ndarray
-        ``(g + 1,)`` where each group of equal hosts starts.
+        ``(g + 1,)`` start of each group of equal hosts.
     hosts : ndarray
         ``(g, 2)``.
     positions : ndarray
-        ``(k, 3)`` point positions of the search.
+        ``(k, 3)`` positions of the points at the search.
     """
 
     first: NDArray[np.int32]
@@ -92,22 +88,13 @@ class ContactPairs(NamedTuple):
 
 
 def search_pairs(y: FloatArray, sheet: Sheet, skin: float) -> ContactPairs:
-    """Candidate pairs in the order of their hosts, grouped by them.
-
-    Parameters
-    ----------
-    y : ndarray
-        ``(k, 3)`` mm, points now.
-    sheet : Sheet
-    skin : float
-        mm by which the search exceeds the reach of a pair.
-    """
+    """Candidate pairs of points ``y (k, 3)`` mm that are closer than their reach plus ``skin``."""
     n = len(y)
     radius = sheet.activation * float(sheet.thickness.max()) + skin
     cells = _cells(y, sheet.by_host, radius / FINENESS)
     ends = np.zeros(n + 1, dtype=np.int64)
-    # Large arrays are made here and not in the kernels: numpy has them on huge pages, and their
-    # first use would otherwise take longer than the search.
+    # Large arrays are allocated here and not in the kernels: numpy puts them on huge pages, whose
+    # first use is faster.
     second = np.empty(EXPECTED * n, dtype=np.int32)
     count = _candidates(y, sheet, cells, radius, skin, ends, second)
     if count > len(second):
@@ -120,10 +107,10 @@ def search_pairs(y: FloatArray, sheet: Sheet, skin: float) -> ContactPairs:
 
 
 class _Cells(NamedTuple):
-    """Cubes of space: their number per axis, the cube of each point, and the members of each.
+    """Cubes of space: their number per axis, the cube of each point, and their members.
 
-    The members of a cube come by host, from ``start``; the ``table (4, k)`` has where they are,
-    one axis after the other, and their numbers.
+    The members of a cube begin at ``start``, sorted by host; ``table (4, k)`` holds their three
+    coordinates and their numbers.
     """
 
     counts: IntArray
@@ -166,9 +153,9 @@ def _candidates(
     ends: IntArray,
     second: NDArray[np.int32],
 ) -> int:
-    """How many pairs there are; their second points, as far as there is room for them.
+    """Number of pairs; writes their second points as far as there is room.
 
-    ``ends[p + 1]`` is where the pairs end whose first point is the p-th by host.
+    ``ends[p + 1]`` is the end of the pairs whose first point is the p-th in the order of hosts.
     """
     n = len(y)
     host, place, start = sheet.host, cells.place, cells.start
@@ -191,8 +178,7 @@ def _candidates(
                 some = 0
                 for q in range(start[row + low], start[row + high]):
                     rr = (y0 - x0[q]) ** 2 + (y1 - x1[q]) ** 2 + (y2 - x2[q]) ** 2
-                    # Written in any case and kept by counting on: nothing for the processor to
-                    # predict wrongly.
+                    # Always written, and kept by advancing the counter: no branch to mispredict.
                     near_ones[some], squares[some] = q, rr
                     some += int((rr < limit) & (owner[q] >= own))
                 for k in range(some):
@@ -201,8 +187,7 @@ def _candidates(
                         continue
                     mean = 0.5 * (sheet.thickness[i] + sheet.thickness[j])
                     reach = _reach(sheet.rest, i, j, sheet.activation * mean)
-                    # Neighbours that would have to be compressed to half their rest distance
-                    # never touch.
+                    # Neighbours that would touch only at half their rest distance never do.
                     if reach <= 0.5 * sheet.distance * mean or squares[k] >= (reach + skin) ** 2:
                         continue
                     if count < len(second):
@@ -214,7 +199,7 @@ def _candidates(
 
 @nb.njit(cache=True, inline="always")
 def _reach(rest: FloatArray, i: int, j: int, full: float) -> float:
-    """Activation distance of a pair: ``full``, or less if it is close at rest."""
+    """Activation distance of a pair: ``full``, or less if the pair is close at rest."""
     apart = 0.0
     for c in range(3):
         apart += (rest[i, c] - rest[j, c]) ** 2
@@ -229,7 +214,7 @@ def _grouped(
     points: NDArray[np.int32],
     lengths: FloatArray,
 ) -> tuple[IntArray, IntArray]:
-    """Write the pairs in the order of both hosts, and their lengths; where groups start, hosts."""
+    """Write pairs and lengths sorted by both hosts; return the starts of groups and their hosts."""
     host, by_host, thickness = sheet.host, sheet.by_host, sheet.thickness
     n, count = len(by_host), ends[-1]
     place = np.zeros(host.max() + 1, dtype=np.int64)
@@ -268,41 +253,32 @@ def _grouped(
 
 
 HARMLESS = 0.02
-"""mm; a step that moves no point farther cannot take sheets through each other."""
+"""mm; a step in which all points move less cannot move sheets through each other."""
 
 CLEARANCE = 1e-3
-"""mm between midsurfaces that touch nowhere: equilibria keep a part of their thickness. Detection
-of collisions from a distance of zero does not end."""
+"""Least distance (mm) of midsurfaces; equilibria keep part of a thickness. Collision detection from
+a distance of zero does not terminate."""
 
 MAX_SUBDIVISIONS = 100_000
-"""Of one pair's times while a collision is looked for, 10 MB; a pair in doubt then counts as
+"""Subdivisions of time per pair in collision detection (10 MB); an undecided pair then counts as
 colliding (Wang et al. 2021, ACM Trans. Graph. 40:188, section 5)."""
 
 _DETECTION = ipctk.TightInclusionCCD(max_iterations=MAX_SUBDIVISIONS)
-# It warns on stdout of sheets that touch, which the step's outcome says.
+# It would print warnings about touching sheets, which the outcome of the step reports anyway.
 ipctk.set_logger_level(ipctk.LoggerLevel.error)
 
 RINGS = 3
-"""Edges between points that count as neighbours within the sheet."""
+"""Largest number of edges between neighbours within the sheet."""
 
 
 class Passing:
-    """Guards a triangulated sheet of points against passing through itself.
-
-    Parameters
-    ----------
-    sheet : Sheet
-    triangles : ndarray
-        ``(t, 3)`` of the points.
-    skin : float
-        mm by which the search for pairs exceeds their reach.
-    """
+    """Collisions of a sheet with itself, given its ``triangles (t, 3)`` and the skin (mm)."""
 
     def __init__(self, sheet: Sheet, triangles: IntArray, skin: float) -> None:
         self.triangles = triangles
         self._near = _near_at_rest(sheet, triangles)
-        # A pair that is neither listed nor near at rest has the reference distance for its reach at
-        # least.
+        # The reach of a pair that is neither listed nor near at rest is at least the reference
+        # distance.
         self._unlisted = sheet.distance * float(sheet.thickness.min()) + skin
         faces = np.asfortranarray(triangles, dtype=np.int32)
         self.mesh = ipctk.CollisionMesh(np.asfortranarray(sheet.rest), ipctk.edges(faces), faces)
@@ -310,9 +286,9 @@ class Passing:
     def free_share(
         self, pairs: ContactPairs, y: FloatArray, dy: FloatArray, *, detect: bool = False
     ) -> float:
-        """Share of the move ``dy (k, 3)`` mm from ``y (k, 3)`` that takes no sheet through another.
+        """Share of the move ``dy (k, 3)`` mm from ``y (k, 3)`` without a collision.
 
-        With ``detect`` collisions are looked for even where distances exclude them.
+        With ``detect`` the collision detection always runs.
         """
         if float(np.max(np.abs(dy), initial=0.0)) < HARMLESS:
             return 1.0
@@ -328,7 +304,7 @@ class Passing:
         return 1.0 if free >= 1.0 else 0.8 * float(free)
 
     def stays_apart(self, pairs: ContactPairs, y: FloatArray, dy: FloatArray) -> bool:
-        """Whether points that are no neighbours are proved too far apart for triangles to meet."""
+        """Whether points other than neighbours are proved too far apart for triangles to meet."""
         longest = _longest_edges(y, dy, self.triangles)
         moved = np.sqrt(np.max(np.sum((y - pairs.positions) ** 2, axis=1)))
         moved += np.sqrt(np.max(np.sum(dy**2, axis=1)))
@@ -348,9 +324,9 @@ class Passing:
 def _near_at_rest(
     sheet: Sheet, triangles: IntArray
 ) -> tuple[NDArray[np.int32], IntArray, IntArray]:
-    """Pairs ``(2, p)`` that a search may leave out at any distance, and the neighbours of points.
+    """Pairs ``(2, p)`` that the search may omit at any distance, and neighbours of each point.
 
-    The neighbours of point i are those from ``start[i]`` to ``start[i + 1]``.
+    The neighbours are given by their starts ``(k + 1,)`` and their numbers.
     """
     rest, thickness = sheet.rest, sheet.thickness
     n = len(rest)
@@ -361,7 +337,7 @@ def _near_at_rest(
     for _ in range(RINGS - 1):
         reached = (reached @ step).tocsr()
     reached.sort_indices()
-    # Their reach is NEIGHBOUR times the distance at rest; beyond this it is the reference distance.
+    # Their reach is NEIGHBOUR times the distance at rest, less than the reference distance.
     share = sheet.distance / NEIGHBOUR
     pairs = cKDTree(rest).query_pairs(share * float(thickness.max()), output_type="ndarray")
     apart = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1)
@@ -372,7 +348,7 @@ def _near_at_rest(
 
 @nb.njit(cache=True)
 def _longest_edges(y: FloatArray, dy: FloatArray, triangles: IntArray) -> FloatArray:
-    """Longest edge ``(k,)`` of the triangles around each point, anywhere along the move."""
+    """Longest edge ``(k,)`` of the triangles around each point during the move."""
     out = np.zeros(len(y))
     for t in range(len(triangles)):
         longest = 0.0
@@ -391,7 +367,7 @@ def _longest_edges(y: FloatArray, dy: FloatArray, triangles: IntArray) -> FloatA
 
 @nb.njit(cache=True, inline="always")
 def approaching(y: FloatArray, dy: FloatArray, i: int, j: int) -> tuple[float, float, float]:
-    """Square of the vector between two points, its product with its change, and that's square."""
+    """Products of the vector r between two points and its change s: r.r, r.s and s.s."""
     rr, rd, dd = 0.0, 0.0, 0.0
     for c in range(3):
         r = y[i, c] - y[j, c]
@@ -412,7 +388,7 @@ def _stay_apart(
     start: IntArray,
     neighbours: IntArray,
 ) -> bool:
-    """Whether all pairs but neighbours stay farther apart than those of triangles that meet."""
+    """Whether all pairs except neighbours stay too far apart for their triangles to meet."""
     for k in range(len(first)):
         i, j = first[k], second[k]
         rr, rd, dd = approaching(y, dy, i, j)

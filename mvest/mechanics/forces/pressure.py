@@ -1,9 +1,9 @@
 """Follower pressure on the ventricular faces, with its load stiffness.
 
-The pressure acts on the current surface: on a face with positions ``x(xi, eta)`` the nodal force is
-``f_a = p int N_a (x_xi x x_eta) dxi deta`` against the outward normal, hence the minus sign of the
-load. The load stiffness ``df_a/dx_b`` is exact. Between faces its skew part cancels; along the rim
-of the loaded surface it stays.
+The pressure acts on the current surface, against the outward normal: a face with positions
+``x(xi, eta)`` has the nodal forces ``f_a = -p int N_a (x_xi x x_eta) dxi deta``. The load stiffness
+``df_a/dx_b`` is exact. Its skew part cancels between faces and remains along the rim of the loaded
+surface.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class PressureLoad:
     Parameters
     ----------
     faces : ndarray
-        ``(f, k)`` nodes, normals pointing out of the solid (into the fluid that presses).
+        ``(f, k)`` nodes, normals pointing out of the solid into the fluid.
     face_type : str
         ``tri3``, ``tri6`` or ``quad9``.
     """
@@ -32,10 +32,10 @@ class PressureLoad:
         self.face = FACES[face_type]
 
     def rim(self) -> IntArray:
-        """Pairs ``(s, 2)`` of nodes between which the load stiffness is not symmetric.
+        """Pairs ``(s, 2)`` of nodes with an unsymmetric load stiffness.
 
-        Two nodes of a face on the rim of all faces: on a line from one of its nodes to the next
-        that no other face runs along the other way round.
+        Two nodes of a face on the rim of all faces: on an edge line that no other face has in the
+        opposite direction.
         """
         lines = self.faces[:, self.face.corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)]
         lines = lines.reshape(-1, 2)
@@ -70,8 +70,8 @@ class PressureLoad:
         factor : float
             MPa.
         positions, skew : ndarray
-            ``(f, k, k)`` where the blocks of pairs of nodes lie in the symmetric and in the skew
-            part, negative where they are in none.
+            ``(f, k, k)`` positions of the blocks in the symmetric and in the skew part, negative
+            for none.
         blocks : ndarray
             N/mm.
         """

@@ -1,8 +1,8 @@
-"""Material laws: what the solid needs from a law, and the laws of leaflet tissue.
+"""Material laws: the interface that the solid needs, and the laws of leaflet tissue.
 
-Arrays of points have the axes (element, quadrature point, component). Strain and stress are
-six-vectors 11, 22, 33, 23, 13, 12 in the fibre frame of the point, strain with engineering shear,
-stress the second Piola-Kirchhoff one in MPa.
+Arrays of points have the axes (element, quadrature point, component). Strain (with engineering
+shear) and second Piola-Kirchhoff stress (MPa) are six-vectors 11, 22, 33, 23, 13, 12 in the fibre
+frame.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class Points(NamedTuple):
 
 @runtime_checkable
 class Law(Protocol):
-    """What the solid needs from a material law (see :class:`mvest.mechanics.law.biot.BiotLaw`)."""
+    """Interface of a material law (see :class:`mvest.mechanics.law.biot.BiotLaw`)."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of parameter (:data:`mvest.mechanics.parameters.KINDS`) that it knows."""
+        """Kinds of its parameters (:data:`mvest.mechanics.parameters.KINDS`)."""
 
     def strain(self, green: FloatArray) -> FloatArray:
         """Strain measure ``(e, q, 6)`` whose rate is damped."""
@@ -56,8 +56,8 @@ class Law(Protocol):
     ) -> FloatArray:
         """Derivative of the stress ``(e, q, 6)`` by a parameter of region ``which``.
 
-        At fixed strain; ``stress`` is what `response` has given at the same points, of which the
-        derivative is often a multiple. InputError if the parameter is none of `kinds`.
+        At fixed strain; ``stress`` is that of `response` at the same points. InputError if the
+        parameter is none of `kinds`.
         """
 
     def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:

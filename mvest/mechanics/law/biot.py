@@ -11,28 +11,27 @@ With the right stretch :math:`U = \sqrt{I + 2E}` and the Biot strain :math:`\eps
     S(E) &= L^T T, \qquad L = d\epsilon / dE, \\
     D(E) &= L^T C L + T : d^2\epsilon / dE^2 .
 
-This is the energy-consistent corotational ("large displacement, small strain") form: the second
-Piola-Kirchhoff stress S is the derivative of the energy also where U and C : epsilon do not
-commute, a term that the usual corotational element force ``R K (R^T x - X)`` drops for an
-anisotropic C.
+This is the energy-consistent corotational ("large displacement, small strain") form: S is the
+derivative of the energy even if U and C : epsilon do not commute. The usual corotational element
+force ``R K (R^T x - X)`` drops that term of an anisotropic C.
 
 In the eigenbasis of U (eigenvalues l_i): ``L: dE_ij -> 2 dE_ij / (l_i + l_j)`` and, from
 differentiating ``U U = I + 2E`` twice, ``T : d2U = -S : (dU dU) `` twice polarised, with
-``S_ij = 2 T_ij / (l_i + l_j)``. No difference of eigenvalues appears, so coinciding stretches need
-no special case.
+``S_ij = 2 T_ij / (l_i + l_j)``. No difference of eigenvalues appears, so equal stretches need no
+special case.
 
 Kelvin-Voigt damping (the stiffness-proportional part of Rayleigh damping in its objective form)
 adds ``beta d(epsilon)/dt`` to epsilon; with backward Euler
-``T = C : (epsilon + rate (epsilon - epsilon_n))`` where ``rate = beta / dt``. It neither resists
-nor drives rigid rotation.
+``T = C : (epsilon + rate (epsilon - epsilon_n))`` where ``rate = beta / dt``. Rigid rotation is
+not affected.
 
-The usual corotational tetrahedron, which the paper's simulation has, is linear in a turned frame.
-The force of an element at positions x is that of linear elasticity in a frame that turns with it,
+In the usual corotational tetrahedron, as in the paper's simulation, the force of an element is that
+of linear elasticity in a frame that rotates with the element,
 
 .. math:: f = R K (R^T x - X), \qquad K = V B^T C B,
 
-with R of the element's edges (:class:`mvest.mechanics.solid.EdgeRotations`). The tangent is taken
-at fixed R: :math:`R K R^T`. Neither is exact for a law with an energy.
+with the rotation R of its edges (:class:`mvest.mechanics.solid.EdgeRotations`) and the tangent
+:math:`R K R^T` at fixed R. It has no energy.
 """
 
 from __future__ import annotations
@@ -54,11 +53,9 @@ ROOT = np.sqrt(2.0)
 TINY = 1e-200
 CONTRACT = {"contract"}
 LANES = 64
-"""Points that are worked on together, so that each operation is one on vectors: a quarter of the
-time that one point after the other takes."""
+"""Points that are processed together, so that all operations vectorise (four times faster)."""
 SCALE = np.array([1.0, 1.0, 1.0, ROOT, ROOT, ROOT])
-"""What the six components of a stress are multiplied by, and those of a strain divided, so that
-their norm is the tensor's."""
+"""Factors on the components of a stress, and divisors of those of a strain, that preserve norms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,8 +67,8 @@ class BiotLaw:
     stiffness : ndarray
         ``(n_regions, 6, 6)`` MPa.
     corotational : bool
-        Whether the strain that it is given is already the linear one, in the turned frame of the
-        element (:class:`mvest.mechanics.solid.EdgeRotations`), and the stress that in this frame.
+        Whether strain and stress are the linear ones in the rotated frame of the element
+        (:class:`mvest.mechanics.solid.EdgeRotations`).
     """
 
     stiffness: FloatArray
@@ -86,7 +83,7 @@ class BiotLaw:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The parameters that the law knows (see :mod:`mvest.mechanics.parameters`)."""
+        """Kinds of its parameters (see :mod:`mvest.mechanics.parameters`)."""
         return ("E_f",)
 
     def strain(self, green: FloatArray) -> FloatArray:
@@ -105,9 +102,9 @@ class BiotLaw:
     def partial_stress(
         self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
     ) -> FloatArray:
-        """Derivative of S ``(e, q, 6)``; InputError if the law does not know the parameter."""
+        """Derivative of S ``(e, q, 6)``; InputError if the law has no such parameter."""
         parameter.require(self.kinds)
-        # All moduli follow E_f: S is linear in the scale of C.
+        # All moduli are proportional to E_f.
         return np.where((at.region == which)[:, None, None], stress, 0.0) / parameter.value
 
     def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
@@ -125,9 +122,9 @@ class BiotLaw:
 
 @nb.njit(cache=True, error_model="numpy")
 def _eigen(a: FloatArray, q: FloatArray) -> None:
-    """Diagonalise symmetric matrices ``a (6, LANES)`` in place; ``q (3, 3, LANES)`` their vectors.
+    """Diagonalise symmetric matrices ``a (6, LANES)`` in place (cyclic Jacobi).
 
-    Cyclic Jacobi, in which a rotation of nothing is as good as another.
+    ``q (3, 3, LANES)`` are their eigenvectors.
     """
     for i in range(3):
         for j in range(3):
@@ -167,11 +164,11 @@ def _spectral(
     g: FloatArray,
     r: FloatArray,
 ) -> None:
-    """What is needed of the points ``start`` to ``start + LANES`` of strains ``green (n, 6)``.
+    """Spectral decomposition at the points ``start`` to ``start + LANES`` of ``green (n, 6)``.
 
-    Written are ``l_i - 1`` (``stretch``, six components in the eigenbasis, of which three are 0),
-    the factors ``g = 2 / (l_i + l_j)`` of the six components there, and the rotations
-    ``r (6, 6, LANES)`` into it, which are orthogonal for six-vectors scaled by ``SCALE``.
+    Writes ``l_i - 1`` (``stretch``, six components in the eigenbasis, three of them 0), the factors
+    ``g = 2 / (l_i + l_j)`` of the six components, and the rotations ``r (6, 6, LANES)`` into the
+    eigenbasis, orthogonal for six-vectors scaled by ``SCALE``.
     """
     for lane in range(LANES):
         point = green[min(start + lane, len(green) - 1)]
@@ -181,8 +178,8 @@ def _spectral(
     _eigen(a, q)
     for k in range(3):
         for lane in range(LANES):
-            # An enhanced strain can leave the admissible set during a Newton iteration; a positive
-            # floor keeps the numbers finite, and the line search rejects such a state.
+            # An enhanced strain can become inadmissible during a Newton iteration. A positive floor
+            # keeps the numbers finite, and the line search rejects such a state.
             stretch[k, lane] = np.sqrt(max(a[k, lane], 1e-6)) - 1.0
             g[k, lane] = 1.0 / (1.0 + stretch[k, lane])
     for k in range(3):
@@ -230,7 +227,7 @@ def _transposed_times(m: FloatArray, v: FloatArray, out: FloatArray) -> None:
 
 @nb.njit(cache=True)
 def _scaled(values: FloatArray, start: int, power: int, out: FloatArray) -> None:
-    """The points of ``values (n, 6)`` times ``SCALE``, or over it (``power = -1``)."""
+    """Write ``values (n, 6)`` times ``SCALE``, or divided by it (``power = -1``)."""
     for lane in range(LANES):
         for k in range(6):
             factor = SCALE[k] if power > 0 else 1.0 / SCALE[k]
@@ -248,7 +245,7 @@ def _unscaled(values: FloatArray, start: int, power: int, out: FloatArray) -> No
 
 @nb.njit(cache=True)
 def _room() -> tuple[FloatArray, ...]:
-    """Where `_spectral` works and writes."""
+    """Work arrays of `_spectral`."""
     return (
         np.empty((6, LANES)),
         np.empty((3, 3, LANES)),
@@ -332,7 +329,7 @@ def _add_curvature(s: FloatArray, g: FloatArray, d: FloatArray) -> None:
             d[3 + k, i, lane] -= one
             d[j, 3 + k, lane] -= other
             d[3 + k, j, lane] -= other
-            # The shears ki and kj have the axis k in common; left of them is the shear ij.
+            # The shears ki and kj share the axis k and couple to the shear ij.
             mixed = half / ROOT * g[3 + i, lane] * g[3 + j, lane]
             d[3 + i, 3 + j, lane] -= mixed
             d[3 + j, 3 + i, lane] -= mixed
@@ -342,8 +339,8 @@ def _add_curvature(s: FloatArray, g: FloatArray, d: FloatArray) -> None:
 def _linear(green: FloatArray, values: FloatArray, power: int) -> FloatArray:
     """``L^T T (e, q, 6)`` of stresses T (``power = 1``), ``L dE`` of strains dE (``-1``).
 
-    Scaled alike, L is its own transpose. With ``power = 0`` it is the Biot strain itself: one
-    kernel, for compiling it takes longer than it ever runs.
+    Scaled, L is its own transpose. With ``power = 0`` the result is the Biot strain itself; one
+    kernel for all three saves compilation.
     """
     out, points, given = np.empty(values.shape), green.reshape(-1, 6), values.reshape(-1, 6)
     flat = out.reshape(-1, 6)

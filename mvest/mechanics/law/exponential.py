@@ -1,4 +1,4 @@
-r"""A fibre-reinforced exponential law of leaflet tissue, and one on the way to it.
+r"""A fibre-reinforced exponential law of leaflet tissue, and its blend with the linear law.
 
 With the stretch of the fibres :math:`\lambda = \sqrt{I_4}`, the first invariant of the isochoric
 deformation :math:`\bar I_1 = J^{-2/3} \mathrm{tr}\, C` and :math:`C = I + 2E`,
@@ -12,44 +12,41 @@ deformation :math:`\bar I_1 = J^{-2/3} \mathrm{tr}\, C` and :math:`C = I + 2E`,
             + W_{ff}\, e_1 \otimes e_1 + W_a\, a'' \\
          &\quad + \kappa \left(J^2 C^{-1} \otimes C^{-1} - (J^2 - 1) C^{-1} \odot C^{-1}\right),
 
-where :math:`a = \bar I_1 - 3`, a prime is a derivative by E, and f stands for :math:`E_{11}`, of
-which alone :math:`\lambda = \sqrt{1 + 2 E_{11}}` is a function in the fibre frame.
+where :math:`a = \bar I_1 - 3`, a prime is a derivative by E, and f stands for :math:`E_{11}`, the
+only component on which :math:`\lambda = \sqrt{1 + 2 E_{11}}` depends in the fibre frame.
 
 The exponential is that of May-Newman and Yin (1998, J. Biomech. Eng. 120:38) for mitral leaflets.
 Prot, Skallerud and Holzapfel (2007, Int. J. Numer. Meth. Engng 71:987) have :math:`(I_4 - 1)^2` in
-place of :math:`(\lambda - 1)^4`. Three things are added to it:
+place of :math:`(\lambda - 1)^4`. Three additions:
 
-* fibres bear tension only (:math:`\langle \cdot \rangle` is the positive part). The fourth power
-  keeps W three times continuously differentiable there; the square would make the tangent jump.
-* a neo-Hookean ground of shear modulus mu, because the exponential alone has no stiffness at rest.
-* a penalty kappa on the change of volume instead of exact incompressibility. It acts on J alone and
-  the exponential on the isochoric :math:`\bar I_1`, so that at rest there is no stress; the fibre
-  term is not split, since fibres feel their full stretch.
+* Fibres bear tension only (:math:`\langle \cdot \rangle` is the positive part). The fourth power
+  keeps W three times continuously differentiable; with a square the tangent would jump.
+* A neo-Hookean ground matrix of shear modulus mu, because the exponential has no stiffness at rest.
+* A penalty kappa on the volume change instead of incompressibility. It acts on J and the
+  exponential on the isochoric :math:`\bar I_1`, so that there is no stress at rest. The fibre term
+  is not split, since fibres feel their full stretch.
 
-Every term is polyconvex. Beyond Q = ``MAX_EXPONENT`` the exponential goes on as its own
-parabola, so that a Newton iterate far away does not overflow; no tissue gets there.
+Every term is polyconvex. Beyond Q = ``MAX_EXPONENT`` the exponential continues as a parabola, so
+that distant Newton iterates do not overflow; no tissue gets there.
 
 Kelvin-Voigt damping adds the stress ``rate (E - E_n) V`` with ``rate = beta / dt`` and the constant
 isotropic V = ``viscous`` (MPa; half of it for engineering shear). It acts on the rate of the
-Green-Lagrange strain and so leaves rigid rotation alone.
+Green-Lagrange strain and hence not on rigid rotation.
 
-In a biaxial test a thin sheet is stretched along and across its fibres. The stress across the
-thickness is zero, which decides the stretch of the thickness. From it follows the exponential
-tissue that is as stiff as a linear one where closed leaflets are.
+In a biaxial test a thin sheet is stretched along and across its fibres; zero stress across the
+thickness determines its stretch.
 
-It is not known beforehand whether a closed leaflet has stiffened, and moduli fitted with the wrong
-law are off. So the stress of one region is that of both laws,
+Whether a closed leaflet has stiffened is unknown beforehand, and moduli fitted with the wrong law
+are biased. So the stress of a region blends both laws,
 
 .. math::
     S = (1 - w) S_{lin} + w S_{exp}, \qquad w = \frac{\alpha}{1 + \alpha},
 
-where the exponential tissue is as stiff as the linear one of the same modulus where it is stretched
-as closed leaflets are (`as_stiff`). The *stiffening* :math:`\alpha` is the ratio of their shares;
-0 is the linear law, and without end the exponential one. Both parts follow the modulus, so that S
-is proportional to it.
+where the exponential tissue is as stiff as the linear one of the same modulus at the stretches of
+closed leaflets (`as_stiff`). The *stiffening* :math:`\alpha` is the ratio of both shares: 0 is the
+linear law, infinity the exponential one. Both parts are proportional to the modulus.
 
-Damping is that of the linear law whatever the share, so that the way to the equilibrium does not
-depend on it.
+Damping is that of the linear law, so that the path to the equilibrium does not depend on the share.
 """
 
 from __future__ import annotations
@@ -69,18 +66,18 @@ from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, Tissu
 from mvest.typing import FloatArray, IntArray
 
 MAX_EXPONENT = 12.0
-"""Where the exponential ends: 1.6e5 times c0, many times what tears a leaflet."""
+"""Largest exponent: 1.6e5 times c0, many times the strength of a leaflet."""
 
 TURNED_OVER = 1e4
-"""MPa, stiffness towards the state at rest of matter that has turned over (see `response`)."""
+"""Stiffness (MPa) of inverted material towards its state at rest."""
 
 VISCOUS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
-"""Of unit viscous stiffness: stress by strain, component by component."""
+"""Viscous stress over strain, by component, for a unit viscous stiffness."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExponentialLaw:
-    """The law of a body: one set of coefficients per region, all quadrature points at once.
+    """The law of a body with one set of coefficients per region.
 
     Attributes
     ----------
@@ -97,19 +94,18 @@ class ExponentialLaw:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The parameters that the law knows (see :mod:`mvest.mechanics.parameters`)."""
+        """Kinds of its parameters (see :mod:`mvest.mechanics.parameters`)."""
         return EXPONENTIAL_KINDS
 
     def strain(self, green: FloatArray) -> FloatArray:
-        """The Green-Lagrange strain ``(e, q, 6)`` itself is what is damped."""
+        """The damped strain ``(e, q, 6)``: the Green-Lagrange strain itself."""
         return green
 
     def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
         """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa.
 
-        A strain of matter that has turned over, where there is no W, can occur during a Newton
-        iteration. The response is then that of very stiff linear matter, which is far from any
-        equilibrium and leads back.
+        Newton iterates may contain inverted material, for which W is undefined. It responds like
+        very stiff linear material, which leads back to admissible states.
         """
         stress, tangent = _response(at.green, at.region, self.coefficients)
         if at.rate:
@@ -121,13 +117,7 @@ class ExponentialLaw:
     def partial_stress(
         self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
     ) -> FloatArray:
-        """Derivative of S ``(e, q, 6)`` by a coefficient, in which damping has no part.
-
-        Raises
-        ------
-        InputError
-            If the law does not know the parameter.
-        """
+        """Derivative of S ``(e, q, 6)`` by a coefficient; InputError if there is no such one."""
         parameter.require(self.kinds)
         kind = EXPONENTIAL_KINDS.index(parameter.kind)
         return _partial_stress(at.green, at.region, self.coefficients, kind, which)
@@ -137,7 +127,7 @@ class ExponentialLaw:
         return -at.rate * self._viscous(at.region) * d_previous
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
-        """Change of the damped strain ``(e, q, 6)``, which is that of the Green-Lagrange strain."""
+        """Change of the damped strain ``(e, q, 6)``."""
         return d_green
 
     def _viscous(self, region: IntArray) -> FloatArray:
@@ -147,9 +137,9 @@ class ExponentialLaw:
 
 @nb.njit(cache=True)
 def _metric(green: FloatArray, h: FloatArray) -> tuple[float, float]:
-    """C^-1 in ``h`` (no doubled shear), and det C and tr C, of a strain with engineering shear.
+    """Write C^-1 to ``h`` (tensor shear); return det C and tr C.
 
-    The determinant is zero, and ``h`` useless, if C is not positive definite.
+    The determinant is 0 if C is not positive definite.
     """
     a, b, c = 1.0 + 2.0 * green[0], 1.0 + 2.0 * green[1], 1.0 + 2.0 * green[2]
     d, e, f = green[3], green[4], green[5]
@@ -165,7 +155,7 @@ def _metric(green: FloatArray, h: FloatArray) -> tuple[float, float]:
 
 @nb.njit(cache=True)
 def _exponential(q: float) -> tuple[float, float]:
-    """The first two derivatives of exp(q), which is a parabola beyond ``MAX_EXPONENT``."""
+    """First two derivatives of exp(q), continued as a parabola beyond ``MAX_EXPONENT``."""
     e = np.exp(min(q, MAX_EXPONENT))
     return e * (1.0 + max(q - MAX_EXPONENT, 0.0)), e
 
@@ -265,24 +255,16 @@ def _partial_stress(
 
 MAX_ITERATIONS = 100
 TOLERANCE = 1e-12
-"""Change of the thickness strain at which the stretch of the thickness is found."""
+"""Convergence of the logarithmic thickness stretch."""
 
 
 def biaxial_stress(law: Law, stretches: FloatArray, region: int = 0) -> FloatArray:
-    """Nominal stresses ``(n, 2)`` MPa along and across the fibres.
-
-    Parameters
-    ----------
-    law : Law
-    stretches : (n, 2)
-        Along and across the fibres.
-    region : int
-        Of the law.
+    """Nominal stresses ``(n, 2)`` MPa at stretches ``(n, 2)``, both along and across the fibres.
 
     Raises
     ------
     InputError
-        If stretches are not positive, or no thickness is found for them.
+        If stretches are not positive, or no stretch of the thickness is found.
     """
     stretches = np.asarray(stretches, dtype=np.float64)
     if stretches.ndim != 2 or stretches.shape[1] != 2 or not np.all(stretches > 0):
@@ -294,7 +276,7 @@ def biaxial_stress(law: Law, stretches: FloatArray, region: int = 0) -> FloatArr
     for _ in range(MAX_ITERATIONS):
         green[:, 0, 2] = 0.5 * (thickness**2 - 1)
         stress, tangent = law.response(Points(green, where, none, 0.0))
-        # In the logarithm of the thickness, which stays positive whatever the step.
+        # Newton's method in the logarithm keeps the thickness positive.
         slope = tangent[:, 0, 2, 2] * thickness**2 + 2 * stress[:, 0, 2]
         change = -stress[:, 0, 2] / np.where(slope > 0, slope, tangent[:, 0, 2, 2] * thickness**2)
         thickness = thickness * np.exp(np.clip(change, -0.1, 0.1))
@@ -304,13 +286,13 @@ def biaxial_stress(law: Law, stretches: FloatArray, region: int = 0) -> FloatArr
 
 
 CLOSED_STRETCHES = (1.0, 1.11)
-"""Along the fibres and across them: the medians of closed leaflets (``results/law.md``)."""
+"""Median stretches of closed leaflets along and across the fibres (``results/law.md``)."""
 
 
 def as_stiff(tissue: ExponentialTissue, linear: TissueSettings, E_f: float) -> ExponentialTissue:
-    """The tissue with all stresses scaled to those of a linear one of modulus ``E_f`` MPa.
+    """The tissue with stresses scaled to those of a linear one of modulus ``E_f`` MPa.
 
-    At `CLOSED_STRETCHES` the stresses along and across the fibres then have the same mean.
+    At `CLOSED_STRETCHES` both have the same mean of the stresses along and across the fibres.
     """
     factor = E_f * _scale(tissue, linear)
     exponents = {"c1", "c2"}
@@ -326,7 +308,7 @@ def as_stiff(tissue: ExponentialTissue, linear: TissueSettings, E_f: float) -> E
 
 @lru_cache(maxsize=64)
 def _scale(tissue: ExponentialTissue, linear: TissueSettings) -> float:
-    """Factor on the tissue for a modulus of 1 MPa, to which all stresses are in proportion."""
+    """Factor on the stresses of the tissue for a modulus of 1 MPa."""
     stretches = np.array([CLOSED_STRETCHES])
     wanted = biaxial_stress(BiotLaw.of([linear.material(1.0)]), stretches).mean()
     return float(wanted / biaxial_stress(ExponentialLaw.of([tissue]), stretches).mean())
@@ -334,13 +316,13 @@ def _scale(tissue: ExponentialTissue, linear: TissueSettings) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StiffeningLaw:
-    """The law of a body of one region.
+    """Blend of the linear and the exponential law, for a body of one region.
 
     Attributes
     ----------
     linear : BiotLaw
     exponential : ExponentialLaw
-        As stiff where closed leaflets are stretched.
+        Of the same stiffness at the stretches of closed leaflets.
     stiffening : float
         Share of the exponential law over that of the linear one, at least 0.
     """
@@ -368,7 +350,7 @@ class StiffeningLaw:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The parameters that the law knows (see :mod:`mvest.mechanics.parameters`)."""
+        """Kinds of its parameters (see :mod:`mvest.mechanics.parameters`)."""
         return ("E_f", "stiffening")
 
     def strain(self, green: FloatArray) -> FloatArray:
@@ -386,7 +368,7 @@ class StiffeningLaw:
     def partial_stress(
         self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
     ) -> FloatArray:
-        """Derivative of S ``(e, q, 6)``; InputError if the law does not know the parameter."""
+        """Derivative of S ``(e, q, 6)``; InputError if the law has no such parameter."""
         parameter.require(self.kinds)
         if parameter.kind == "E_f":
             return stress / parameter.value
@@ -395,7 +377,7 @@ class StiffeningLaw:
         return (exponential - linear) / (1.0 + self.stiffening) ** 2
 
     def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
-        """Change of S ``(e, q, 6)`` for a change of the previous strain: of the damping alone."""
+        """Change of S ``(e, q, 6)`` for a change of the previous strain."""
         return self.linear.history_stress(at, d_previous)
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The elastic moduli of a leaflet, and the one-parameter family that the paper has."""
+"""The elastic moduli of a leaflet, and the paper's one-parameter family."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from mvest.typing import FloatArray
 
 
 class PoissonReading(Enum):
-    """How the single Poisson ratio of the paper is read.
+    """Interpretation of the paper's single Poisson ratio.
 
-    LITERAL: the same ratio along and across the fibre. NEARLY_INCOMPRESSIBLE: the transverse ratio
-    follows from the wish that uniaxial tension along the fibre and across it keep the volume to the
-    same degree, ``nu_pp = 2 nu (1 - E_p / (2 E_f))``.
+    LITERAL: the same ratio along and across the fibre. NEARLY_INCOMPRESSIBLE: uniaxial tension
+    along and across the fibre changes the volume equally, ``nu_pp = 2 nu (1 - E_p / (2 E_f))``.
     """
 
     LITERAL = "A"
@@ -34,14 +33,14 @@ class TransverselyIsotropic:
     G : float
         Shear modulus of planes that contain the fibre, MPa.
     nu_fp, nu_pp : float
-        Poisson ratios: contraction across under tension along the fibre, and within the plane
-        perpendicular to it.
+        Poisson ratios: contraction across the fibre under tension along it, and within the plane
+        across the fibre.
 
     Raises
     ------
     MaterialError
-        If the elastic energy would not be positive definite (Jones 1975, Mechanics of Composite
-        Materials, section 2.4): all moduli positive, ``|nu_pp| < 1`` and
+        The elastic energy is not positive definite (Jones 1975, Mechanics of Composite Materials,
+        section 2.4), which needs positive moduli, ``|nu_pp| < 1`` and
         ``1 - nu_pp - 2 nu_fp^2 E_p / E_f > 0``.
     """
 
@@ -52,8 +51,8 @@ class TransverselyIsotropic:
     nu_pp: float
 
     def __post_init__(self) -> None:
-        values = {name: float(getattr(self, name)) for name in ("E_f", "E_p", "G")}
-        for name, value in values.items():
+        for name in ("E_f", "E_p", "G"):
+            value = float(getattr(self, name))
             if not np.isfinite(value) or value <= 0:
                 raise MaterialError(f"{name} = {value} MPa, expected > 0")
         if not abs(self.nu_pp) < 1:

@@ -1,41 +1,33 @@
-r"""Tissue that differs from place to place: its laws, a modulus that varies, and prestretch.
+r"""Tissue that varies in space: regional laws, a modulus field, and prestretch.
 
-Over a leaflet a modulus varies as a smooth random field in a few coefficients. The logarithm of E_f
-is its leaflet's value plus a Gaussian field of mean zero whose covariance between two points of the
-leaflet is :math:`\sigma^2 k(X, X')` with the squared exponential :math:`k = \exp(-|X - X'|^2 / (2
-l^2))` of their distance in the reference (open) frame. It is expanded in its first modes
-(Karhunen-Loeve; Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, section
-4.3.1, which also has the way to points between, eq. 4.44),
+Within a leaflet, log E_f may vary as a Gaussian field with few coefficients: its leaflet's value
+plus a field of mean zero with the covariance :math:`\sigma^2 k(X, X')`, the squared exponential
+:math:`k = \exp(-|X - X'|^2 / (2 l^2))` of the distance in the reference (open) frame. The field is
+expanded in its first modes (Karhunen-Loeve; Rasmussen and Williams 2006, Gaussian Processes for
+Machine Learning, section 4.3.1; for points in between eq. 4.44),
 
 .. math::
     \log E_f(X) = \log E_f + \sum_k a_k \phi_k(X), \qquad
     \phi_k(X) = \frac{\sigma}{\sqrt{\lambda_k}} \sum_j \sqrt{w_j} \, k(X, X_j) \, v_{jk}
 
-with :math:`v_k, \lambda_k` the eigenpairs of :math:`\sqrt{w_i} k(X_i, X_j) \sqrt{w_j}` over the
-vertices of the leaflet's surface and the areas w that belong to them. A priori the coefficients
-:math:`a_k` are independent and standard normal. No mesh is in it: every mesh of a valve has the
-same modulus at the same point.
+with the eigenpairs :math:`v_k, \lambda_k` of :math:`\sqrt{w_i} k(X_i, X_j) \sqrt{w_j}` over the
+vertices of the leaflet's surface and their areas w. A priori the coefficients :math:`a_k` are
+independent and standard normal. The field does not depend on the mesh. All stiffness at a point,
+damping included, is scaled by :math:`\exp(\sum_k a_k \phi_k)`.
 
-All stiffness of a point, damping included, is scaled by :math:`\exp(\sum_k a_k \phi_k)`.
+A :class:`StiffPatch` is not estimated; it simulates a valve with stiffer tissue at one place.
 
-A :class:`StiffPatch` is not estimated: it simulates a valve whose tissue is stiffer in one place.
-
-Prestretched leaflets are stretched already in the shape in which they were seen open. The open
-valve of an image is under load, and its leaflets were grown under tension: free of stress they
-would be smaller. A leaflet that was seen :math:`\lambda` times as long in both directions of its
-plane as it would be then, at the same volume, has in its fibre frame the deformation
+Prestretch: the leaflets of an imaged open valve are under load and were grown under tension; free
+of stress they would be smaller. If a leaflet of the same volume appears :math:`\lambda` times as
+long in both directions of its plane, its deformation in the fibre frame is
 
 .. math::
     F_0 = F\,G, \qquad G = \mathrm{diag}(\lambda, \lambda, \lambda^{-2}),
 
-of which the law is asked, F being what is done to the shape that was seen. With
-:math:`E_0 = \frac12 (G^T (I + 2E)\, G - I)` the stress is :math:`S = G\, S_0(E_0)\, G^T`, since
-the volume is the same. The shape that was seen is then in no equilibrium by itself; what is
-computed is the closed valve of such leaflets.
-
-That leaflets in the heart are prestrained, and that a closed valve of porcine leaflets comes nearer
-to what echocardiography shows where the model has it, is found by Prot and Skallerud (2017, Int. J.
-Numer. Meth. Biomed. Engng 33:e2806).
+where F deforms the imaged shape. With :math:`E_0 = \frac12 (G^T (I + 2E)\, G - I)` the stress is
+:math:`S = G\, S_0(E_0)\, G^T`, since the volume is the same. The imaged shape itself is then not in
+equilibrium. Prot and Skallerud (2017, Int. J. Numer. Meth. Biomed. Engng 33:e2806) found leaflets
+in the heart to be prestrained, and a model with prestrain to be closer to echocardiography.
 """
 
 from __future__ import annotations
@@ -58,14 +50,14 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldBasis:
-    """The modes of one leaflet, to be had at any point.
+    """The modes of one leaflet as functions of the point.
 
     Attributes
     ----------
     support : (s, 3) mm
         Vertices of the leaflet.
     combination : (s, k)
-        What their covariances with a point are multiplied by.
+        Factors on their covariances with a point.
     length : float
         mm.
     """
@@ -76,13 +68,7 @@ class FieldBasis:
 
     @classmethod
     def of(cls, surface: LeafletSurface, region: str, settings: ModulusField) -> FieldBasis:
-        """The basis of a leaflet.
-
-        Raises
-        ------
-        InputError
-            If there is no such leaflet, or it has fewer vertices than modes.
-        """
+        """The basis of a leaflet; InputError if it is missing or has fewer vertices than modes."""
         _check_region(region, surface.region_names)
         own = surface.triangles[surface.region == surface.region_names.index(region)]
         vertices, triangles = np.unique(own, return_inverse=True)
@@ -99,7 +85,7 @@ class FieldBasis:
         n = len(vertices)
         values, vectors = eigh(covariance, subset_by_index=(n - settings.modes, n - 1))
         values, vectors = values[::-1], vectors[:, ::-1]
-        # A mode is as good as its negative: the larger of its extremes is made positive.
+        # The sign of a mode is arbitrary: the larger of its extremes is made positive.
         shapes = vectors / root[:, None]
         largest = shapes[np.argmax(np.abs(shapes), axis=0), np.arange(settings.modes)]
         combination = settings.std_log * root[:, None] * vectors * np.sign(largest)
@@ -124,14 +110,10 @@ def _kernel(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
 def at_quadrature(
     mesh: SolidMesh, region: str, of: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
-    """What a function gives at the quadrature points of a leaflet's elements, 0 in the others.
+    """Values of a function at the quadrature points of a leaflet, 0 in the other elements.
 
-    ``of`` maps points ``(e, q, 3)`` mm of the reference frame to values ``(e, q, ...)``.
-
-    Raises
-    ------
-    InputError
-        If the mesh has no such leaflet.
+    ``of`` maps points ``(e, q, 3)`` mm of the reference frame to values ``(e, q, ...)``. InputError
+    if the mesh has no such leaflet.
     """
     _check_region(region, mesh.region_names)
     shape = mesh.reference.shape(mesh.reference.points)
@@ -144,7 +126,7 @@ def at_quadrature(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModulusVariation:
-    """How the modulus varies within the leaflets, at the quadrature points of a mesh.
+    """Variation of the modulus within the leaflets, at the quadrature points of a mesh.
 
     Attributes
     ----------
@@ -158,7 +140,7 @@ class ModulusVariation:
     given: FloatArray | float = 0.0
 
     def scale(self, values: Mapping[str, float]) -> FloatArray:
-        """Factor ``(e, q)`` on the stiffness; coefficients without a value are 0."""
+        """Factor ``(e, q)`` on the stiffness; missing coefficients are 0."""
         log = np.asarray(self.given)
         for region, own in self.modes.items():
             a = [values.get(f"field.{region}.{k}", 0.0) for k in range(own.shape[2])]
@@ -167,24 +149,24 @@ class ModulusVariation:
 
 
 POWERS = np.array([2.0, 2.0, -4.0, -1.0, -1.0, 2.0])
-"""Of the prestretch, by which components of C and S of the shape that was seen are multiplied."""
+"""Powers of the prestretch that multiply the components of C and S of the imaged shape."""
 NORMAL = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeafletLaw:
-    """The laws of the regions of a mesh, whose tissue may be prestretched and vary in stiffness.
+    """Laws of the regions of a mesh, with prestretch and varying stiffness.
 
     Attributes
     ----------
     laws : tuple of Law
-        One that knows all regions, or one per region that knows this region alone.
+        One law of all regions, or one law of a single region for each.
     region : ndarray
-        ``(e,)`` of the elements; a law is not given it with a strain.
+        ``(e,)`` of the elements.
     prestretch : ndarray
         ``(r,)`` of each region.
     scale : ndarray or float
-        Factor ``(e, q)`` on the stiffness, of ``variation``.
+        Factor ``(e, q)`` on the stiffness from ``variation``.
     variation : ModulusVariation, optional
     """
 
@@ -196,12 +178,12 @@ class LeafletLaw:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of parameters that any of the laws knows, the prestretch and coefficients."""
+        """Kinds of the parameters of all laws, the prestretch and the field."""
         own = [kind for law in self.laws for kind in law.kinds]
         return tuple(dict.fromkeys([*own, "prestretch", "field"]))
 
     def strain(self, green: FloatArray) -> FloatArray:
-        """Strain measures ``(e, q, 6)`` of the laws, from leaflets free of stress."""
+        """Strain measures ``(e, q, 6)`` of the laws, relative to stress-free leaflets."""
         whole, out = self._whole(green), np.empty_like(green)
         for law, own, *_ in self._parts():
             out[own] = law.strain(whole[own])
@@ -230,8 +212,7 @@ class LeafletLaw:
         Raises
         ------
         InputError
-            If it is by a prestretch and the valve moves: what is damped depends on it as well; or
-            by a mode that the leaflet's field does not have.
+            For an unknown mode, or a prestretch of a moving valve (damping depends on it, too).
         """
         if parameter.kind == "field":
             return stress * self._mode(parameter)[..., None]
@@ -239,7 +220,7 @@ class LeafletLaw:
         if parameter.kind == "prestretch":
             if at.rate:
                 raise InputError(
-                    f"parameter {parameter.name!r}: there are derivatives by a prestretch at an "
+                    f"parameter {parameter.name!r}: derivatives by a prestretch exist at an "
                     "equilibrium only"
                 )
             given, tangent = self._of_laws(at)
@@ -263,16 +244,16 @@ class LeafletLaw:
 
     @property
     def _stretch(self) -> FloatArray:
-        """Factor ``(e, 1, 6)`` on the components of C and S by the prestretch."""
+        """Factor ``(e, 1, 6)`` of the prestretch on the components of C and S."""
         return np.asarray(self.prestretch[self.region, None, None] ** POWERS)
 
     def _whole(self, green: FloatArray) -> FloatArray:
-        """Green-Lagrange strain ``(e, q, 6)`` from the shape that is free of stress."""
+        """Green-Lagrange strain ``(e, q, 6)`` relative to the stress-free shape."""
         stretch = self._stretch
         return np.asarray(stretch * green + 0.5 * (stretch - 1.0) * NORMAL)
 
     def _parts(self) -> Iterator[tuple[Law, slice | IntArray, IntArray, int]]:
-        """Each law, its elements, their regions as it counts them, and the first of its regions."""
+        """Each law, its elements, their regions in its numbering, and its first region."""
         if len(self.laws) == 1:
             yield self.laws[0], slice(None), self.region, 0
             return

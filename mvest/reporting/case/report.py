@@ -85,9 +85,10 @@ def report(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(folder, error) from error
-    record = result
-    if isinstance(record, Personalised):
-        record, arrays = record_of_case(record), arrays or arrays_of_case(record)
+    if isinstance(result, Personalised):
+        record, arrays = record_of_case(result), arrays or arrays_of_case(result)
+    else:
+        record = result
     written = [write_atomically(folder / UNKNOWNS, unknown_table(record.unknowns).csv())]
     if arrays:
         written += _write_page(folder, record, case_fields(arrays), line, provenance or {})

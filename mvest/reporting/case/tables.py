@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from typing import Any
 
 from mvest.personalisation.result import Expected
@@ -116,11 +115,10 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
 
 def expected_tables(expected: Expected) -> dict[str, Table]:
     """What an estimate could tell, by name: ``unknowns``, ``shares`` and ``narrower``."""
-    shares = [asdict(one) | {"source": label_of(one.source)} for one in expected.shares]
     return {
         "unknowns": expected_table(expected.unknowns),
-        "shares": _shares(shares),
-        "narrower": _narrower([asdict(one) for one in expected.narrower]),
+        "shares": _shares(expected.shares),
+        "narrower": _narrower(expected.narrower),
     }
 
 

@@ -13,7 +13,7 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
 from mvest.problem.fields import CaseFields
-from mvest.reporting.case.drawing import BLOOD, TISSUE, distance_top, leak_of
+from mvest.reporting.case.drawing import BLOOD, TISSUE, leak_of
 from mvest.reporting.figures import LEAFLET_COLOURS
 from mvest.reporting.markup import shown_text
 from mvest.typing import FloatArray, IntArray
@@ -21,7 +21,7 @@ from mvest.typing import FloatArray, IntArray
 DECIMALS = 2
 """Positions are stored to 0.01 mm."""
 LINE, CHORD, TIP = "#1a1a1a", "#8a817c", "#59382f"
-GHOST, UNOBSERVED = "#8c8c8c", "#bfbfbf"
+GHOST = "#8c8c8c"
 
 PERSONALISED = "closed, personalised"
 """The state that is shown first, if there is an estimate."""
@@ -89,18 +89,9 @@ def states_of(fields: CaseFields, names: Sequence[str]) -> dict[str, list[Any]]:
         ghost = _mesh(fields.observed[k], fields.triangles, color=GHOST, hoverinfo="skip")
         seen = [ghost.update(opacity=0.45)]
         states["closed, observed"] = _anatomy(fields, fields.observed[k], frame, names)
-    distances = {}
-    for label, shape, off in (
-        ("generic", fields.generic, fields.distance_generic),
-        ("personalised", fields.fitted, fields.distance_fitted),
-    ):
+    for label, shape in (("generic", fields.generic), ("personalised", fields.fitted)):
         if shape is not None:
             states[f"closed, {label}"] = _anatomy(fields, shape[k], frame, names)
-            if off is not None:
-                distances[label] = shape[k], off[k]
-    top = distance_top(*(off for _, off in distances.values())) if distances else 0.0
-    for label, (points, off) in distances.items():
-        states[f"distance, {label}"] = _coloured(fields, points, frame, off, top)
     if fields.fitted is not None and seen:
         model = _anatomy(fields, fields.fitted[k], frame, names)
         states["observed (grey) over personalised"] = [*model, *seen]
@@ -126,28 +117,6 @@ def _anatomy(fields: CaseFields, points: FloatArray, frame: int, names: Sequence
     return parts
 
 
-def _coloured(
-    fields: CaseFields, points: FloatArray, frame: int, distance: FloatArray, top: float
-) -> list[Any]:
-    """A mesh coloured by distance, grey where it is unknown."""
-    known = np.isfinite(distance[fields.triangles]).all(axis=1)
-    mesh = _mesh(
-        points,
-        fields.triangles[known],
-        distance,
-        colorscale="Viridis",
-        cmin=0.0,
-        cmax=top,
-        colorbar={"title": {"text": "mm"}, "len": 0.6, "thickness": 14},
-        hovertemplate="%{intensity:.2f} mm<extra></extra>",
-    )
-    parts = [mesh, *_leak(fields, points, frame), *_rings(fields, points)]
-    if not known.all():
-        unseen = fields.triangles[~known]
-        parts.append(_mesh(points, unseen, color=UNOBSERVED, hoverinfo="skip"))
-    return parts
-
-
 def _leak(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
     """The gap of a closed valve and the slit between touching leaflets, every second pixel."""
     if not frame or (leak := leak_of(fields, points, frame)) is None:
@@ -165,9 +134,7 @@ def _leak(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
     return parts
 
 
-def _mesh(
-    points: FloatArray, triangles: IntArray, values: FloatArray | None = None, **style: Any
-) -> Any:
+def _mesh(points: FloatArray, triangles: IntArray, **style: Any) -> Any:
     """A mesh of the triangles without a NaN, and of the vertices that they use."""
     known = np.isfinite(points[triangles]).all(axis=(1, 2))
     used, corner = np.unique(triangles[known], return_inverse=True)
@@ -175,7 +142,6 @@ def _mesh(
     x, y, z = small(points[used]).T
     return go.Mesh3d(
         x=x, y=y, z=z, i=i, j=j, k=k,
-        intensity=None if values is None else small(values[used]),
         flatshading=False,
         lighting={"ambient": 0.4, "diffuse": 0.65, "specular": 0.1, "roughness": 0.6},
         lightposition={"x": -4e4, "y": -4e4, "z": 1e5},

@@ -62,13 +62,8 @@ def _check_shape(name: str, shape: tuple[int, ...], expected: tuple[int | None, 
 class BandGrid(NamedTuple):
     """A grid of leaflets from annulus to free edge, in material coordinates.
 
-    Attributes
-    ----------
-    phi : (n,) degrees
-    s : (n,)
-    triangles : (m, 3)
-    region : (m,)
-        Leaflet of each triangle.
+    ``phi (n,)`` degrees and ``s (n,)`` of the vertices, ``triangles (m, 3)``, and the leaflet
+    ``region (m,)`` of each triangle.
     """
 
     phi: FloatArray
@@ -299,10 +294,9 @@ class Valve:
         n = len(self.surface.vertices)
         set_(self, "annulus", checked_indices("annulus", self.annulus, n, (None,)))
         set_(self, "free_edge", checked_indices("free_edge", self.free_edge, n, (None,)))
-        set_(
-            self, "papillary_tips", checked_floats("papillary_tips", self.papillary_tips, (None, 3))
-        )
-        n_tips = len(self.papillary_tips)
+        tips = checked_floats("papillary_tips", self.papillary_tips, (None, 3))
+        set_(self, "papillary_tips", tips)
+        n_tips = len(tips)
         if len(self.chordae) and int(self.chordae.tip.max()) >= n_tips:
             i = int(np.argmax(self.chordae.tip))
             raise InputError(

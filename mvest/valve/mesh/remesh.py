@@ -86,7 +86,7 @@ def remesh(
         places = np.linspace(0, arc[-1], max(3, round(arc[-1] / h)), endpoint=False)
         loops.append(loop[np.unique(np.abs(arc[:-1, None] - places).argmin(axis=0))])
     kept = np.concatenate(loops)
-    nearest = cKDTree(x[kept]).query(x)[0]
+    nearest = np.asarray(cKDTree(x[kept]).query(x)[0])
     nearest[np.concatenate([annulus, free_edge])] = 0.0
     while len(kept) < vertices and nearest.any():
         kept = np.append(kept, np.argmax(nearest))
@@ -175,11 +175,11 @@ def layered_wedges(
     # A point has the weight one half, its neighbours one half together.
     pairs = surface_edges(sheet[:, FACES["tri6"].corners].reshape(-1, 3))
     near = sp.csr_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
-    near = near + near.T
-    average = 0.5 * (sp.identity(len(points)) + sp.diags(1 / near.sum(axis=1).A1) @ near)
+    near = sp.csr_matrix(near + near.T)
+    degree = np.asarray(near.sum(axis=1)).ravel()
     for _ in range(SMOOTHING):
-        normals = unit_rows(average @ normals)
-        thickness = average @ thickness
+        normals = unit_rows(normals + (near @ normals) / degree[:, None])
+        thickness = 0.5 * (thickness + (near @ thickness) / degree)
     fibre = unit_rows(fibre - normals * np.sum(fibre * normals, axis=1, keepdims=True))
     per_layer = LEVELS_PER_LAYER[element_type]
     levels = layers * per_layer + 1

@@ -115,28 +115,6 @@ def test_iterated_mode_ends_at_the_posterior_mode():
 # --- Counting, stopping, reporting ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "method", [PaperFilter(Q=0.01), IteratedFilter(), IteratedFilter(start=(9.0,))]
-)
-def test_forward_solves_are_counted_and_none_is_repeated(method):
-    model = Counted(square)
-    estimate = by_hand(method, model)
-    np.testing.assert_array_equal(estimate.iterate_std[-1], estimate.std)
-    assert estimate.forward_solves == len(model.calls)
-    assert len({float(m[0]) for m in model.calls}) == len(model.calls)
-    # The reported prediction is that of the estimate itself, to the last bit.
-    assert estimate.prediction.y[0] == estimate.mean[0] ** 2
-
-
-def test_each_iterate_is_reported():
-    seen = []
-    estimate = by_hand(IteratedFilter(), names=["E"], on_iterate=lambda *args: seen.append(args))
-    assert estimate.names == ("E",)
-    assert [number for number, _, _ in seen] == list(range(estimate.iterations + 1))
-    np.testing.assert_array_equal([m for _, m, _ in seen], estimate.iterates)
-    np.testing.assert_array_equal([J for _, _, J in seen], estimate.objective)
-
-
 # --- Step control --------------------------------------------------------------------------------
 
 

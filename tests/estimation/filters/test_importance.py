@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mvest.estimation import Gaussian, ImportanceFilter, Prediction, Reason, UnscentedFilter
+from mvest.estimation import Gaussian, ImportanceFilter, Reason, UnscentedFilter
 from tests.estimation.problems import Linear, banana, gridded, wings
 
 
@@ -50,20 +50,3 @@ def test_too_few_runs_are_said_to_be_too_few() -> None:
     assert found.reason is Reason.NOT_SAMPLED
     assert not found.trusted
     assert "effective" in found.why + found.detail
-
-
-def test_where_the_model_fails_there_is_no_posterior() -> None:
-    def positive_only(m):
-        if m[0] <= 0.0:
-            return Prediction.failed("not positive")
-        return Prediction(m.copy(), np.eye(1))
-
-    prior = Gaussian(np.array([0.5]), np.eye(1))
-    found = ImportanceFilter()(positive_only, prior, np.array([0.2]), 0.25)
-    assert found.transformed_samples is not None
-    assert np.all(found.transformed_samples > 0.0)
-    # N(0.26, 0.2) cut at zero.
-    grid = np.linspace(0.0, 4.0, 4001)
-    density = np.exp(-0.5 * (grid - 0.26) ** 2 / 0.2)
-    expected = np.sum(grid * density) / np.sum(density)
-    assert found.mean[0] == pytest.approx(expected, abs=4.0 * 0.3 / np.sqrt(60.0))

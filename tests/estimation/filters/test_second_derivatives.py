@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from mvest.estimation.estimate import Reason
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import observation_noise
 from mvest.estimation.prediction import Prediction
-from mvest.estimation.sampled import SampledErrors
 
 N = 400
 RNG = np.random.default_rng(3)
@@ -79,30 +76,3 @@ def test_iterations_that_do_not_end_are_ended_by_newton_steps():
     assert better.reason is Reason.CONVERGED
     exact = filtered(y, tolerance=1e-8, max_iterations=200)
     assert np.all(np.abs(better.mean - exact.mean) < 0.1 * exact.std)
-
-
-def test_errors_by_samples_reach_the_estimate_as_they_move_it():
-    y = observed(-4.0)
-    better = filtered(y, second_order=True)
-    # Far below the noise: no sample changes the gain.
-    samples = 1e-3 * (SLOPES @ RNG.normal(size=(3, 4)))
-    exact = {"tolerance": 1e-10, "objective_tolerance": 1e-16, "max_iterations": 400}
-
-    def moved(d):
-        up, down = (filtered(y + sign * d, **exact).mean for sign in (1.0, -1.0))
-        return 0.5 * (up - down)
-
-    moves = np.stack([moved(d) for d in samples.T], axis=1)
-    errors = SampledErrors(observation_noise(1.0, N), samples)
-    H = bent(better.mean).jacobian
-    widened = (stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975)) ** 2
-    expected = widened / 4 * moves @ moves.T
-    found = errors.posterior(H, PRIOR.covariance, curvature=better.curvature)
-    assert found.from_samples == pytest.approx(expected, rel=0.1)
-    linear = errors.posterior(H, PRIOR.covariance)
-    assert np.max(np.abs(np.diag(linear.from_samples) / np.diag(expected) - 1.0)) > 0.3
-    # What is left of the prior's error.
-    errors = SampledErrors(observation_noise(1.0, N), 1e-9 * SLOPES)
-    left = np.linalg.inv(np.eye(2) + H.T @ H + better.curvature)
-    found = errors.posterior(H, PRIOR.covariance, curvature=better.curvature).covariance
-    assert found == pytest.approx(left @ left.T, rel=1e-6)

@@ -7,7 +7,6 @@ from scipy import sparse
 from mvest.estimation import (
     Gaussian,
     IteratedFilter,
-    PaperFilter,
     Prediction,
     chi_square_band,
     moran,
@@ -87,15 +86,6 @@ def test_iterated_mode_is_consistent(model):
     if model is linear:
         # A linearised innovation has a mean of second order.
         assert abs(innovations.mean()) < 3.0 * innovations.std() / np.sqrt(innovations.size)
-
-
-def test_counting_the_data_three_times_is_found():
-    # The paper's mode with Q = 0 after three rounds claims a third of the variance: where the data
-    # decide, NEES is about three times too large.
-    naive = PaperFilter(Q=0.0, tolerance=1e-300, max_iterations=3)
-    errors, _, _ = monte_carlo(naive, linear, runs=100)
-    assert not consistent(errors, 2)
-    assert 5.0 < np.mean(errors) < 7.5
 
 
 def test_innovation_summary():

@@ -80,18 +80,6 @@ def test_parameters_that_act_alike_are_named_with_how_one_makes_up_for_the_other
     assert exact.confounded(width=1e-4)[0].correlation == pytest.approx(group.correlation)
 
 
-def test_three_that_share_one_direction_are_one_group():
-    # Ratios of a and b to c are seen to 1 %, c itself to 50 %: whatever c is, a and b are as much.
-    # d is seen by itself.
-    H = np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, -1.0, 0.0], [0, 0, 0.02, 0], [0, 0, 0, 0.1]])
-    found = identifiability(H, 1e-4, np.ones(4), names=("a", "b", "c", "d"))
-    (group,) = found.confounded()
-    assert sorted(group.parameters) == ["a", "b", "c"]
-    assert group.relative == pytest.approx((0.1, 0.1, 0.1), rel=1e-3)
-    # corr(a, c) = 0.5 / √(0.5² + 0.01²)
-    assert group.correlation == pytest.approx(0.5 / np.hypot(0.5, 0.01), rel=1e-3)
-
-
 def test_what_is_not_determined_is_told_as_such_and_not_as_a_correlation():
     H = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 1.0]])
     found = identifiability(H, 1.0, np.ones(3), names=("a", "b", "c"))

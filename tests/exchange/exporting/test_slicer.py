@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import SimpleITK
 
 from mvest.cases.case import Role
 from mvest.cases.folder import write_case
 from mvest.errors import InputError
 from mvest.exchange.exporting.slicer import SlicerOptions, export_slicer
 from mvest.valve.geometry.thickening import thicken
-from mvest.valve.geometry.triangles import areas, principal_stretches
+from mvest.valve.geometry.triangles import principal_stretches
 from tests.cases.folders import template_case
 
 vtk = pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")
@@ -26,7 +25,7 @@ CASE = template_case(32, 10)
 def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("slicer")
     write_case(folder / "case", CASE)
-    return export_slicer(folder / "case", folder / "out", SlicerOptions(voxel_mm=0.8))
+    return export_slicer(folder / "case", folder / "out", SlicerOptions())
 
 
 def read(path):
@@ -65,30 +64,6 @@ def test_paraview_and_slicer_read_the_frames_over_time(exported):
     assert last["stretch_of_area"] == pytest.approx(
         last["stretch_largest"] * last["stretch_smallest"]
     )
-
-
-def test_a_segmentation_has_slicerhearts_names_codes_and_place(exported):
-    frame = CASE.frame(Role.CLOSED)
-    image = SimpleITK.ReadImage(str(exported / "closed.seg.nrrd"))
-    labels = SimpleITK.GetArrayFromImage(image)
-    header = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys()}
-    for number, (name, code) in enumerate(
-        (("mitral_anterior_leaflet", "a"), ("mitral_posterior_leaflet", "p"))
-    ):
-        assert header[f"Segment{number}_Name"] == name
-        tags = header[f"Segment{number}_Tags"]
-        # Category and type of SlicerHeartSegmentationCategoryTypeModifier.json.
-        assert "TerminologyEntry:SlicerHeart segmentation category and type~" in tags
-        assert "~SCT^91134007^Mitral Valve~" in tags
-        assert f"~SlicerHeart^sh-leaflet-mv-{code}^{name.replace('_', ' ')}~^^~" in tags
-        own = np.unique(frame.triangles[frame.region == number])
-        inner = np.setdiff1d(own, frame.triangles[frame.region != number])
-        at = [image.TransformPhysicalPointToIndex(p) for p in frame.vertices[inner].tolist()]
-        here = np.array([labels[k, j, i] for i, j, k in at])
-        assert (here == number + 1).mean() > 0.9
-        volume = (labels == number + 1).sum() * 0.8**3
-        area = areas(frame.vertices, frame.triangles[frame.region == number]).sum()
-        assert volume / area == pytest.approx(1.3, rel=0.25)
 
 
 def test_landmarks_have_slicerhearts_labels(exported):
@@ -133,7 +108,7 @@ def test_a_run_is_written_with_its_distances(tmp_path):
         fitted=stretched[None],
         distance_fitted=np.full((1, len(rest)), 0.25),
     )
-    out = export_slicer(tmp_path / "run", tmp_path / "out", SlicerOptions(voxel_mm=1.5))
+    out = export_slicer(tmp_path / "run", tmp_path / "out", SlicerOptions())
     assert {path.name for path in out.glob("*.pvd")} == {"observed.pvd", "fitted.pvd"}
     first, last = (arrays_of(read(out / f"fitted_000{k}.vtp").GetPointData()) for k in (0, 1))
     assert set(first) == set(last)
@@ -141,7 +116,6 @@ def test_a_run_is_written_with_its_distances(tmp_path):
     assert (last["distance_mm"] == 0.25).all()
     assert first["stretch_largest"] == pytest.approx(1.0)
     assert last["stretch_largest"].max() == pytest.approx(1.2, abs=1e-3)
-    assert (out / "open.seg.nrrd").is_file()
     assert (out / "closed.mrk.json").is_file()
 
 
@@ -186,8 +160,6 @@ def test_what_is_no_case_and_no_run_is_refused(tmp_path, exported):
         export_slicer(tmp_path / "empty", tmp_path / "out", SlicerOptions())
     with pytest.raises(InputError, match="exists; expected a new folder"):
         export_slicer(tmp_path / "empty", exported, SlicerOptions())
-    with pytest.raises(InputError, match=r"voxel_mm=0, expected 0\.1 to 3 mm"):
-        SlicerOptions(voxel_mm=0)
     assert not (tmp_path / "out").exists()
 
 
@@ -196,5 +168,5 @@ def test_frames_with_vertices_of_their_own_are_written(tmp_path):
     other = replace(closed, corresponds=False)
     case = replace(CASE, frames=(CASE.frames[0], other))
     write_case(tmp_path / "case", case)
-    out = export_slicer(tmp_path / "case", tmp_path / "out", SlicerOptions(voxel_mm=1.5))
+    out = export_slicer(tmp_path / "case", tmp_path / "out", SlicerOptions())
     assert set(arrays_of(read(out / "frames_0001.vtp").GetPointData())) == set()

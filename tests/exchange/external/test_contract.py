@@ -54,18 +54,14 @@ ORDER = '{"format": "mvest-external", "version": 1, "status": "converged", "reas
     ("file", "content", "message"),
     [
         ("response.json", None, "response.json is missing"),
-        ("response.json", "[1]", "holds a list"),
         ("response.json", ORDER.replace("1,", "2,"), "version: 2, expected"),
         ("response.json", ORDER.replace("converged", "ok"), "status: 'ok', expected"),
         ("response.json", ORDER + " " * 1_000_001, "expected at most 1000000"),
-        ("observation.csv", None, "observation.csv is missing"),
         ("observation.csv", "1,2,3\n4,5,6\n", "columns 1,2,3"),
         ("observation.csv", "x,y,z\n1,2,3\n", "1 rows, expected 2"),
-        ("observation.csv", "x,y,z\n" + "1,2,3\n" * 3, "3 rows, expected 2"),
         ("observation.csv", "x,y,z\n1,2,3\n4,nan,6\n", "y of row 1 is 'nan'"),
         ("jacobian.csv", "E,nu\n" + "1,2\n" * 6, "columns E,nu, expected E,nu, local"),
         ("jacobian.csv", 'E,"nu, local"\n' + "1,2\n" * 5, "5 rows, expected 6"),
-        ("jacobian.csv", 'E,"nu, local"\n' + "1,-inf\n" * 6, "nu, local of row 0"),
     ],
 )
 def test_a_damaged_answer_is_refused(tmp_path, file, content, message):
@@ -85,11 +81,8 @@ def test_a_damaged_answer_is_refused(tmp_path, file, content, message):
     ("change", "message"),
     [
         ({"parameters": []}, "parameters: .*at least 1"),
-        ({"parameters": 3}, "parameters: 3"),
         ({"parameters": [{"name": "a"}]}, "parameters.0.value: .*required"),
-        ({"parameters": [{"name": "", "value": 1}]}, "parameters.0.name"),
         ({"points": 0}, "points: 0"),
-        ({"settings": 1}, "settings: 1"),
     ],
 )
 def test_what_is_no_request_is_refused(tmp_path, change, message):

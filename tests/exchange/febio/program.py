@@ -26,23 +26,9 @@ VARIABLE = "MVEST_FEBIO"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FebRun:
-    """What became of a run.
+    """The result of a run: times ``(s,)`` s and positions ``(s, n, 3)`` mm, CPU seconds.
 
-    Attributes
-    ----------
-    converged : bool
-        Whether FEBio came to the end.
-    reason : str
-        The last complaint of its log, where it did not.
-    times : (s,)
-        s of the steps that it completed, the reference state first.
-    frames : (s, n, 3) mm
-        Positions of the nodes of the mesh that was given.
-    steps, iterations : int
-        As FEBio counts them.
-    seconds : float
-        Processor time of the program.
-    version : str
+    ``reason`` is the last complaint of the log of a run that did not converge.
     """
 
     converged: bool
@@ -56,13 +42,7 @@ class FebRun:
 
 
 def febio_program() -> Path:
-    """The program.
-
-    Raises
-    ------
-    ConfigurationError
-        If there is none.
-    """
+    """The program, or a ConfigurationError."""
     given = os.environ.get(VARIABLE)
     found = given or shutil.which("febio4")
     if not found or not Path(found).is_file():
@@ -74,10 +54,9 @@ def febio_program() -> Path:
 
 
 def restored(mesh: SolidMesh, x: FloatArray) -> FloatArray:
-    """Positions ``(..., n, 3)`` mm of the nodes of a mesh, from those of FEBio's of it.
+    """Positions ``(..., n, 3)`` mm of the nodes of a mesh, from those of FEBio's mesh.
 
-    Those that FEBio's wedge lacks, in the middle of the sides of wedge18, follow from its
-    interpolation.
+    The midpoints of the sides of wedge18, which FEBio lacks, follow from its interpolation.
     """
     own, x = febio_mesh(mesh), np.array(x)
     if own.element_type == "wedge18":
@@ -93,25 +72,7 @@ def restored(mesh: SolidMesh, x: FloatArray) -> FloatArray:
 def run_febio(
     document: FebDocument, mesh: SolidMesh, path: Path, *, time_limit_s: float = 3600.0
 ) -> FebRun:
-    """Write a document and run FEBio on it, with one thread.
-
-    Parameters
-    ----------
-    document : FebDocument
-    mesh : SolidMesh
-        That it was made from.
-    path : Path
-        Of the input file; FEBio writes beside it.
-    time_limit_s : float
-        After which it is stopped, which is a run that did not converge.
-
-    Raises
-    ------
-    ConfigurationError
-        If there is no program.
-    OSError
-        If it cannot be started, or a file cannot be written.
-    """
+    """Write the document of a mesh to a path and run FEBio on it, with one thread."""
     program = febio_program()
     document.write(path)
     environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

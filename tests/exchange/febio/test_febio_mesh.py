@@ -12,9 +12,7 @@ from mvest.exchange.febio.document import FebDocument
 from mvest.exchange.febio.mesh import NAMES, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.body import box, outer_faces
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
-from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.solid_mesh import SolidMesh
-from mvest.valve.mesh.structured import structured_mesh
 from tests.exchange.febio.program import restored
 
 # Where FEBio's shape functions of hex27 are one, from FESolidElementShape.cpp: a factor 0.5 r (r+1)
@@ -129,14 +127,6 @@ def test_the_other_side_is_as_large_and_looks_the_other_way(kind):
     corners = mesh.nodes[faces[:, [0, 2, 8]]] if faces.shape[1] == 9 else x[:, :3]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
     assert np.all(normal[:, 2] < 0)
-
-
-@pytest.mark.parametrize("kind", ["hex18", "tet10"])
-def test_atrial_faces_of_a_valve(kind):
-    mesh = febio_mesh(structured_mesh(Template(), kind, 12, 2))
-    faces = opposite_faces(mesh)
-    assert not np.isin(faces, mesh.pressure_faces).any()
-    assert len(faces) == len(mesh.pressure_faces)
 
 
 A = TransverselyIsotropic.from_ratio(6.23, 2.651, 0.488, PoissonReading.LITERAL)

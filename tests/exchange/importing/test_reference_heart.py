@@ -4,7 +4,6 @@ The tip of a papillary muscle is its end towards the leaflets, wherever it lies.
 """
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from experiments.studies.imported import import_heart
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.plausibility import implausible_values
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.segmented import HEAD_MM, papillary_tip
 from tests.exchange.importing.made_up_heart import (
@@ -115,17 +113,6 @@ def test_the_file_as_it_is_distributed_is_the_same_heart(case, tmp_path):
         imported(tmp_path, source=str(path), **named)
 
 
-def test_any_heart_is_a_source_like_others(folder, case):
-    muscles = tuple(str(folder / name) for name in PARTS[1:])
-    known = LeafletsOptions(units="mm", muscles=muscles, smoothing_mm=4.0)
-    found = import_leaflets(folder / PARTS[0], known)
-    assert found.surface.vertices == pytest.approx(case.surface.vertices, abs=1e-9)
-    assert found.frames[0].papillary_tips == pytest.approx(case.frames[0].papillary_tips, abs=1e-9)
-    assert any("the middle of the last 5 mm of each muscle" in line for line in found.derived)
-    with pytest.raises(InputError, match="as in a mirror"):
-        import_leaflets(folder / PARTS[0], replace(known, muscles=muscles[::-1]))
-
-
 def test_the_heart_itself_is_a_plausible_valve():
     if not (HEART / PARTS[0]).is_file():
         pytest.skip("needs the reference heart (conf/experiment); name its folder in MVEST_HRA")
@@ -145,9 +132,8 @@ def muscle(length=30.0, width=8.0):
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), length * z])
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_head_is_found_at_the_end_towards_the_leaflets(seed):
-    rng = np.random.default_rng(seed)
+def test_the_head_is_found_at_the_end_towards_the_leaflets():
+    rng = np.random.default_rng(0)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.uniform(-50, 50, 3)
     leaflets = np.array([[5.0, 3.0, 45.0], [-5.0, 0.0, 50.0]])
     tip = papillary_tip(muscle() @ turn.T + shift, leaflets @ turn.T + shift)

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import meshio
 import numpy as np
 
 REGIONS = ("anterior", "septal", "posterior")
@@ -78,7 +79,8 @@ def write(folder: Path, data: dict) -> Path:
     (place / f"{CASE}.inp").write_text(deck(data))
     cells = np.concatenate(list(data["quads"].values()))
     for k, points in enumerate(data["frames"]):
-        (place / f"{CASE}_{k}.vtu").write_text(vtu(points, cells))
+        mesh = meshio.Mesh(points, [("quad", cells)])
+        meshio.vtu.write(place / f"{CASE}_{k}.vtu", mesh, binary=False)
     return place / f"{CASE}.inp"
 
 
@@ -125,25 +127,3 @@ def deck(data: dict) -> str:
                   enumerate(vector)]  # fmt: skip
     lines += ["*Dsload, op=NEW, amplitude=Whole", f"Outside, P, {data['pressure']!r}"]
     return "\n".join([*lines, "*End Step", ""])
-
-
-def vtu(points: np.ndarray, cells: np.ndarray) -> str:
-    """The text of one frame."""
-
-    def array(name: str, of: str, values: np.ndarray, parts: int = 1) -> str:
-        text = " ".join(map(repr, values.ravel().tolist()))
-        return (
-            f'<DataArray type="{of}" Name="{name}" NumberOfComponents="{parts}" format="ascii">'
-            f"{text}</DataArray>"
-        )
-
-    return (
-        '<?xml version="1.0"?><VTKFile type="UnstructuredGrid" version="1.0" '
-        'byte_order="LittleEndian"><UnstructuredGrid>'
-        f'<Piece NumberOfPoints="{len(points)}" NumberOfCells="{len(cells)}">'
-        f"<Points>{array('Points', 'Float64', points, 3)}</Points><Cells>"
-        f"{array('connectivity', 'Int64', cells)}"
-        f"{array('offsets', 'Int64', 4 * np.arange(1, len(cells) + 1))}"
-        f"{array('types', 'UInt8', np.full(len(cells), 9))}"
-        "</Cells></Piece></UnstructuredGrid></VTKFile>"
-    )

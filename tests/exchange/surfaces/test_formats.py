@@ -5,39 +5,14 @@ The common ways in which each format is written are `tests.exchange.surface_vari
 
 import numpy as np
 import pytest
-from vtkmodules import vtkIOXML
-from vtkmodules.util.numpy_support import vtk_to_numpy
-from vtkmodules.vtkFiltersCore import vtkStripper, vtkTriangleFilter
-from vtkmodules.vtkFiltersSources import vtkSphereSource
 
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.surfaces import part_of, read_mesh, read_regions, read_surface
+from mvest.exchange.surfaces import Surface, merged, read_mesh, read_regions, read_surface
 from tests.exchange.surfaces.glb import described, write_parts
 
 REGIONS = {0: "anterior", 1: "posterior"}
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0.5], [2, 1, 0.25]])
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3], [1, 4, 5]])
-
-
-def output(step, data=None):
-    if data is not None:
-        step.SetInputData(data)
-    step.Update()
-    return step.GetOutput()
-
-
-def test_strips_as_vtk_makes_them(tmp_path):
-    strips = output(vtkStripper(), output(vtkSphereSource()))
-    assert strips.GetNumberOfStrips()
-    writer = vtkIOXML.vtkXMLPolyDataWriter()
-    writer.SetFileName(str(tmp_path / "a.vtp"))
-    writer.SetInputData(strips)
-    assert writer.Write()
-    read = read_surface(tmp_path / "a.vtp")
-    triangles = output(vtkTriangleFilter(), strips)
-    points = vtk_to_numpy(triangles.GetPoints().GetData())
-    corners = points[vtk_to_numpy(triangles.GetPolys().GetConnectivityArray()).reshape(-1, 3)]
-    np.testing.assert_allclose(read.vertices[read.triangles], corners)
 
 
 def test_polygons_and_what_lies_beside_them(tmp_path):
@@ -49,7 +24,6 @@ def test_polygons_and_what_lies_beside_them(tmp_path):
         "CELL_DATA 6\nSCALARS region int 1\nLOOKUP_TABLE default\n8 9 0 1 2 3\n"
     )
     mesh = read_mesh(tmp_path / "b.vtk")
-    assert mesh.segments.tolist() == [[0, 1], [1, 4]]
     region = mesh.cell_data["region"]
     assert region.tolist() == [0, 0, 1, 1, 2, 3, 3]
     sides = np.diff(mesh.vertices[mesh.triangles], axis=1)
@@ -57,17 +31,6 @@ def test_polygons_and_what_lies_beside_them(tmp_path):
     assert areas.min() > 0
     # A triangle of area 2 without a notch of 0.5; a rectangle; that triangle; the strip.
     assert np.bincount(region, areas) == pytest.approx([1.5, 2.0, 2.0, 2.0])
-
-
-def test_triangles_and_a_strip_keep_their_data(tmp_path):
-    (tmp_path / "a.vtk").write_text(
-        "# vtk DataFile Version 4.2\nmade up\nASCII\nDATASET POLYDATA\nPOINTS 4 float\n"
-        "0 0 0 1 0 0 0 1 0 1 1 0\nPOLYGONS 2 8\n3 0 1 2\n3 1 3 2\nTRIANGLE_STRIPS 1 5\n4 0 1 2 3\n"
-        "CELL_DATA 3\nSCALARS region int 1\nLOOKUP_TABLE default\n5 6 7\n"
-    )
-    read = read_surface(tmp_path / "a.vtk")
-    assert read.triangles.tolist() == [[0, 1, 2], [1, 3, 2], [0, 1, 2], [2, 1, 3]]
-    assert read.cell_data["region"].tolist() == [5, 6, 7, 7]
 
 
 def test_cells_other_than_triangles_are_named(tmp_path):
@@ -92,12 +55,11 @@ def test_parts_are_taken_by_their_names(tmp_path):
     np.testing.assert_array_equal(surface.vertices, POINTS)
     np.testing.assert_array_equal(surface.triangles, TRIANGLES)
     assert list(surface.groups) == ["one and", "one and", "other"]
-    part = part_of(surface, "other")
-    np.testing.assert_array_equal(part.vertices[part.triangles], POINTS[TRIANGLES[2:]])
-    with pytest.raises(InputError, match="no part is called third; there are one and, other"):
-        part_of(surface, "third")
-    with pytest.raises(InputError, match=r"unknown label one and, other at triangles .*known are"):
+    words = r"unknown label one and, other at triangles .*known are .*name them anterior and post"
+    with pytest.raises(InputError, match=words):
         read_regions(tmp_path / "a.obj", REGIONS)
+    with pytest.raises(InputError, match=r"for the region 'AML'; .*name them anterior and post"):
+        read_regions({"AML": tmp_path / "a.obj"}, REGIONS)
 
 
 def test_nodes_place_what_is_below_them(tmp_path):
@@ -128,3 +90,12 @@ def test_nodes_place_what_is_below_them(tmp_path):
     # Normals point upwards still.
     sides = np.diff(corners["mirror"], axis=1)
     assert np.cross(sides[:, 0], sides[:, 1])[:, 2].min() > 0
+
+
+def test_merged_vertices_are_numbered_by_the_triangles():
+    order = np.array([7, 2, 0, 5, 8, 1, 4, 3, 6])
+    points = np.empty((9, 3))
+    points[order] = POINTS[TRIANGLES].reshape(-1, 3)
+    found = merged(Surface(points, order.reshape(-1, 3)))
+    np.testing.assert_array_equal(found.vertices[found.triangles], POINTS[TRIANGLES])
+    assert found.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [1, 4, 5]]

@@ -135,7 +135,6 @@ LAW = re.compile(r"\*Hyperelastic, OGDEN, N=3\n.*\n0\.,")
     [
         ("*Hyperelastic, NEO HOOKE\n1, 2", "trusses of ANTERIOR_CHORDAE: expected .*OGDEN"),
         ("*Hyperelastic, OGDEN, N=3\n1, 2", "N = 3, expected so many pairs"),
-        ("*Hyperelastic, OGDEN\n1, 0, 0", "expected .* a stress > 0"),
         ("*Hyperelastic, OGDEN\n-1, 2, 0", "-.* MPa at a strain of 0.01"),
     ],
 )
@@ -180,31 +179,22 @@ def test_bad_networks(edges, anchors, error, message):
         trace_cables(nodes, np.array(edges), np.array(anchors), np.array([1]))
 
 
-def put(name, change):
-    def apply(data):
-        data[name] = change(data[name])
-
-    return apply
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (put("rim", lambda x: x[:-1]), "expected the two boundary loops"),
-        (put("frames", lambda x: x[:1]), "1 frames Skirt_NUMBER.vtu, expected 2 to 500"),
-        (put("frames", lambda x: x + 1), "Skirt_0.vtu: points are not the nodes of the deck"),
-        (put("frames", lambda x: x[:, :-1]), r"Skirt_0.vtu: \d+ points, the deck has \d+ nodes"),
-        (put("held", lambda x: np.append(x[:-1], 100)), "chord segments are connected to no"),
-        (put("pressure", lambda x: 1e3 * x), "pressure -1.33.*: stresses must be MPa"),
-        (put("nodes", lambda x: 0.001 * x), "the leaflets span 0.02.*: lengths must be mm"),
-        (put("edges", lambda x: x[:0]), "no chordae: expected elements of type T3D2"),
+        ({"rim": lambda x: x[:-1]}, "expected the two boundary loops"),
+        ({"frames": lambda x: x[:1]}, "1 frames Skirt_NUMBER.vtu, expected 2 to 500"),
+        ({"frames": lambda x: x + 1}, "Skirt_0.vtu: points are not the nodes of the deck"),
+        ({"frames": lambda x: x[:, :-1]}, r"Skirt_0.vtu: \d+ points, the deck has \d+ nodes"),
+        ({"pressure": lambda x: 1e3 * x}, "pressure -1.33.*: stresses must be MPa"),
+        ({"nodes": lambda x: 0.001 * x}, "the leaflets span 0.02.*: lengths must be mm"),
+        ({"edges": lambda x: x[:0]}, "no chordae: expected elements of type T3D2"),
     ],
 )
 def test_contradictions(tmp_path, change, message):
     data = skirt()
-    change(data)
-    write(tmp_path, data)
-    with pytest.raises(InputError if "segments" not in message else GeometryError, match=message):
+    write(tmp_path, data | {name: of(data[name]) for name, of in change.items()})
+    with pytest.raises(InputError, match=message):
         read(tmp_path)
 
 
@@ -213,24 +203,17 @@ def test_contradictions(tmp_path, change, message):
     [
         ("type=T3D2", "type=B31", r"line \d+, \*ELEMENT: type B31, expected S4R, S3, T3D2"),
         ("*Nset, nset=Rim\n1,", "*Ngen, nset=Rim\n1,", r"\*NGEN: is not read"),
-        ("*Nset, nset=Rim\n1,", "*Nset, nset=Rim, generate\n1,", r"\*NSET: is not read"),
         ("*Nset, nset=Rim\n1,", "*Nset, nset=Rim\n999,", "999 does not exist"),
-        ("*Nset, nset=Rim", "*Nset, nset=Rand", "no node set 'Rim'; there are ALL"),
+        ("*Nset, nset=Rim", "*Nset, nset=Rand", "no NSET set 'Rim'; there are ALL"),
         (".65, 5", "-.65, 5", "thickness or cross section -0.65, expected > 0"),
         (".65, 5\n", "", "shells without a section that states a thickness"),
-        ("material=anterior\n", "\n", r"\*SHELL SECTION: no MATERIAL="),
         ("Valve.Both, SPOS", "Valve.Both, SNEG", "expected one pressure on all leaflets"),
-        ("Valve.posterior_Quads, SPOS\n", "", "expected one pressure on all leaflets, once"),
         ("Outside, P, ", "Outside, HP, ", "expected pressure P"),
         ("definition=SMOOTH STEP\n0., 0., 1.", "definition=PERIODIC\n0., 0., 1.",
          "PERIODIC, expected SMOOTH STEP"),
-        (", amplitude=Whole\nOutside", "\nOutside", "amplitude '', expected one of WHOLE, EARLY"),
+        (", amplitude=Whole\nOutside", "\nOutside", "no amplitude ''; there are WHOLE, EARLY"),
         ("*End Step\n", "*End Step\n*Dynamic\n, 1.\n", "a second step, expected one"),
-        (", 1.\n*Boundary", "\n*Boundary", "no duration of the step"),
-        ("*Dsload, op=NEW, amplitude=Whole\nOut", "*Dsload\nIn", "'Inside' does not exist"),
-        ("*Part, ", "*Include, input=other.inp\n*Part, ", r"\*INCLUDE: is not read"),
         ("2, 9.", "2, nan, 9.", "damaged numbers|numbers in a line|not finite"),
-        ("\n1, 10.0", "\n1, 1e99", "above 1e"),
         ("** made up", "made up", "line 1: 'made up', expected a keyword first"),
         ("*Instance, name=Valve, part=Leaflet", "*Instance, name=Valve, part=Leaflet\n0, 0",
          "expected one instance, where its part is"),
@@ -260,30 +243,12 @@ def test_a_heading_in_latin_1(tmp_path, recording):
 REAL = ({name: f"{name}_Leaflet_Elements" for name in OGDEN}, "Annular_Nodes", "Free_Edge_Nodes")
 
 
-def real_case(name: str) -> Recording:
-    place = Path(os.environ.get("MVEST_TRIVALVE") or ROOT.parent / "shared" / "data" / "trivalve")
-    if not (place / name).is_dir():
-        pytest.skip("needs the donor valve (conf/experiment); name its folder in MVEST_TRIVALVE")
-    return read_recording(place / name, *REAL)
-
-
 @pytest.fixture(scope="module")
 def real():
-    return real_case("Healthy_QuasiStatic")
-
-
-def test_the_real_diseased_valve():
-    recording = real_case("Diseased_QuasiStatic")
-    motion = recording.valve.motion
-    assert recording.valve.surface.vertices.shape == (10883, 3)
-    assert recording.pressure == pytest.approx(0.00567)
-    moved = motion.papillary_tips - motion.papillary_tips[0]
-    assert moved[-1] == pytest.approx(np.tile([0, 0, -4.0], (6, 1)))
-    # All of it in the first third of the step, the pressure in the rest.
-    assert recording.times[-1] == 1.5
-    assert moved[7:] == pytest.approx(np.tile([0, 0, -4.0], (14, 6, 1)))
-    assert np.flatnonzero(recording.pressure_share)[0] == 7
-    assert np.ptp(motion.annulus, axis=0).max() == 0
+    place = Path(os.environ.get("MVEST_TRIVALVE") or ROOT.parent / "shared" / "data" / "trivalve")
+    if not (place / "Healthy_QuasiStatic").is_dir():
+        pytest.skip("needs the donor valve (conf/experiment); name its folder in MVEST_TRIVALVE")
+    return read_recording(place / "Healthy_QuasiStatic", *REAL)
 
 
 def test_the_real_valve(real):
@@ -296,11 +261,6 @@ def test_the_real_valve(real):
     # Normals leave the skirt: the ventricle is around it.
     middle = surface.vertices[valve.annulus].mean(axis=0)
     assert np.all(((surface.vertices - middle) * surface.normals)[:, :2].sum(axis=1) > 0)
-    # Along the annulus at the annulus.
-    along = np.roll(surface.vertices[valve.annulus], -1, 0) - surface.vertices[valve.annulus]
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    fibre = surface.fibre[valve.annulus]
-    assert np.median(np.abs(np.einsum("ij,ij->i", along, fibre))) > 0.99
 
 
 def test_the_real_chordae(real):

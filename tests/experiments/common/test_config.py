@@ -1,54 +1,13 @@
 import numpy as np
 import pytest
 
-from experiments.common.building.filters import build_filter
-from experiments.common.building.twin import build_twin, truth_mesh
+from experiments.common.building.twin import build_twin
 from experiments.common.config import hash_of
-from experiments.common.schema import build
 from experiments.results.published import as_published
-from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.errors import WhiteNoise
 from tests.experiments.configured import composed, plain
-from tests.places import CONF
 
-HAVING = {
-    "personal": "own_valve",
-    "patient": "patients",
-    "imaging": "imaging",
-    "misspecification": "calibration",
-    "arrival": "surfaces",
-}
 """Group that only some studies have -> an experiment of one that has it."""
-
-EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
-
-
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_composes_and_names_its_table(name: str) -> None:
-    config = plain(composed(f"experiment={name}"))
-    assert config["name"] == name
-    assert config["title"]
-    assert config["row"]
-    assert config["table"]
-    if config["study"] == "twin":
-        build(MechanicsSettings, config["mechanics"])
-        build_filter(config["filter"], tuple(config["parameters"]))
-        assert len(config["truth"]["values"]) == len(config["parameters"])
-    if name.startswith("table1"):
-        assert config["paper"]["table"] == "Table 1"
-        assert config["paper"]["estimate"] == [6.02, 2.13]
-
-
-@pytest.mark.parametrize(
-    ("group", "name"),
-    [
-        (path.parent.name, path.stem)
-        for path in sorted(CONF.glob("*/*.yaml"))
-        if path.parent.name not in ("experiment", "hydra")
-    ],
-)
-def test_every_part_can_be_chosen(group: str, name: str) -> None:
-    plain(composed(f"experiment={HAVING.get(group, 'table1')}", f"{group}={name}"))
 
 
 def test_a_hash_depends_on_what_changes_the_result_only() -> None:
@@ -124,8 +83,8 @@ def test_the_usual_overrides_reach_the_objects() -> None:
     assert type(twin.problem.filter).__name__ == "IteratedFilter"
     assert twin.model.mesh.element_type == "tet4"
     assert {tissue.reading for tissue in twin.model.settings.tissue.values()} == {"C"}
-    assert twin.errors == (WhiteNoise(0.5),)
-    assert list(twin.variance) == [0.01, 0.25]  # type: ignore[arg-type]
+    assert twin.observe.keywords["errors"] == (WhiteNoise(0.5),)
+    assert list(twin.observe.keywords["variance"]) == [0.01, 0.25]
     # Truth and estimator share the mesh here, but no object that could carry a value across.
     assert twin.truth_model is not twin.model
     assert twin.truth_model.fixed is not twin.model.fixed
@@ -149,21 +108,6 @@ def test_guides_are_coarser_down_to_the_coarsest() -> None:
     assert build_twin(plain(composed("guided=false"))).model.guide is None
 
 
-def test_an_independent_truth_differs_in_mesh_element_and_step() -> None:
-    config = plain(composed("experiment=debug", "truth=independent"))
-    twin = build_twin(config)
-    assert twin.truth_model.mesh.element_type == "tet10"
-    assert truth_mesh(config["mesh"], config["truth"])["columns"] == 2 * config["mesh"]["columns"]
-    steps = (twin.truth_model.settings.protocol.dt, twin.model.settings.protocol.dt)
-    assert steps[0] == pytest.approx(steps[1] / 4)
-    assert twin.truth_model.mesh.sha256 != twin.model.mesh.sha256
-
-
-def test_the_default_observation_has_3248_vertices() -> None:
-    observation = plain(composed("experiment=table1"))["observation"]
-    assert observation["columns"] * observation["rows"] == 3248
-
-
 def test_a_population_is_drawn_from_what_its_estimator_states() -> None:
     config = plain(composed("experiment=population"))
     known, patient = config["personal"], config["patient"]
@@ -176,15 +120,3 @@ def test_a_population_is_drawn_from_what_its_estimator_states() -> None:
     modulus = known["unknowns"]["E_f.anterior"]
     log_std = np.sqrt(np.log1p((modulus["std"] / modulus["mean"]) ** 2))
     assert patient["moduli_spread"] == pytest.approx(log_std, abs=0.005)
-
-
-@pytest.mark.parametrize("name", ["own_valve", "patients", "calibration"])
-def test_what_is_not_known_is_carried_by_default(name: str) -> None:
-    personal = plain(composed(f"experiment={name}"))["personal"]
-    assert personal["nuisance_geometry"]["thickness"] == 0.2
-    assert set(personal["nuisance_law"]) == {"anterior", "posterior"}
-    assert personal["unknowns"]["pressure_scale"]["std"] == 0.15
-    assert personal["nuisance_geometry"]["renewals"] > 0
-    known = plain(composed(f"experiment={name}", "personal=nuisances"))["personal"]
-    assert known["nuisance_geometry"] is None
-    assert known["nuisance_law"] == {}

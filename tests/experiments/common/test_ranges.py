@@ -5,18 +5,15 @@ import typing
 from collections.abc import Iterator, Mapping
 
 import pytest
-from omegaconf import OmegaConf
 from pydantic.fields import FieldInfo
 
 from experiments.common.config import Config, plain, require_in_range
 from experiments.common.schema import (
     BY_PARAMETER,
     hints_of,
-    require_admissible_values,
     validated,
 )
 from experiments.common.study import load_study, study_names
-from experiments.runner.cluster import EngineSettings
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS
 from mvest.problem.registration import REGISTRATION, range_of
@@ -63,20 +60,6 @@ def test_every_number_has_a_range(kind: type) -> None:
     assert list(without_range(kind)) == []
 
 
-def test_a_number_without_a_range_is_seen() -> None:
-    @dataclasses.dataclass
-    class Inner:
-        x: float
-
-    @dataclasses.dataclass
-    class Outer:
-        parts: dict[str, Inner]
-
-    hints_of(Inner)
-    assert list(without_range(float, "a")) == ["a"]
-    assert list(without_range(dict[str, Inner], "parts")) == ["parts.*.x"]
-
-
 def test_every_parameter_has_a_range() -> None:
     for name in (*KINDS, *REGISTRATION):
         assert range_of(name) is not None, name
@@ -93,16 +76,6 @@ CHOICES = [[f"experiment={path.stem}"] for path in sorted((CONF / "experiment").
 @pytest.mark.parametrize("overrides", CHOICES, ids=lambda choice: choice[-1])
 def test_all_that_is_configured_is_inside(overrides: list[str]) -> None:
     require_in_range(plain(composed(*overrides)))
-
-
-def test_so_are_the_launchers_settings() -> None:
-    for path in sorted((CONF / "hydra" / "launcher").glob("*.yaml")):
-        values = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
-        require_admissible_values(EngineSettings, values, "hydra.launcher")
-        known = hints_of(EngineSettings)
-        assert all(
-            name in known for name, value in values.items() if isinstance(value, int | float)
-        )
 
 
 @pytest.mark.parametrize(

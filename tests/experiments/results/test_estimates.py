@@ -11,7 +11,6 @@ from pandas import read_csv, read_parquet
 from experiments.cli import main
 from experiments.common.records.record import write_record
 from experiments.results.estimates import COLUMNS, estimate_table, write_estimates
-from experiments.results.published import write_records
 from experiments.sweeps.collected import write_sweep_file
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown
@@ -60,16 +59,6 @@ def test_a_row_for_each_unknown_of_a_case(tmp_path: Path) -> None:
     assert np.isnan(table["relative_error"][1])
 
 
-def test_failures_are_rows_and_other_records_are_none(tmp_path: Path) -> None:
-    record(tmp_path / "died", status="failed", reason="it\nbuckled")
-    record(tmp_path / "other", numbers={"gap_mm": 1.0})
-    table = estimate_table(tmp_path)
-    assert set(table["record"]) == {"died/result.json"}
-    assert set(table["status"]) == {"failed"}
-    assert set(table["reason"]) == {"it buckled"}
-    assert table["estimate"].isna().all()
-
-
 def test_a_sweep_stands_for_its_jobs(tmp_path: Path) -> None:
     record(tmp_path / "sweep" / "jobs" / "a", estimates=(made_up_estimate(),))
     write_sweep_file(tmp_path / "sweep" / "sweep.json", swept())
@@ -78,16 +67,6 @@ def test_a_sweep_stands_for_its_jobs(tmp_path: Path) -> None:
     # Two parameters of two seeds of the first job, and the lost second one.
     assert list(table["seed"]) == [1, 1, 2, 2, 1]
     assert list(table["parameter"].isna()) == [False] * 4 + [True]
-
-
-def test_published_records_and_sweeps_are_read_together(tmp_path: Path) -> None:
-    (tmp_path / "records").mkdir()
-    (tmp_path / "sweeps").mkdir()
-    kept = {name: made_up(estimates=(made_up_estimate(),)) for name in ("a", "b")}
-    write_records(tmp_path, "t", kept)
-    write_sweep_file(tmp_path / "sweeps" / "x.json", swept())
-    places = list(dict.fromkeys(estimate_table(tmp_path)["record"]))
-    assert places == ["records/t.jsonl#a", "records/t.jsonl#b", "sweeps/x.json"]
 
 
 def test_both_forms_hold_the_same_and_the_dictionary_all_columns(tmp_path: Path, capsys) -> None:

@@ -1,6 +1,6 @@
-"""``mvest`` and its worker, held at the stage that the file ``hold`` in the folder names.
+"""``mvest`` and its worker, stopped at the stage that the file ``hold`` names.
 
-There it leaves a file ``at`` and waits for what comes.
+There it writes a file ``at`` and waits.
 """
 
 import ctypes
@@ -13,15 +13,13 @@ from pathlib import Path
 from tests.experiments.runner import fake_worker
 
 PROGRAM = "trap '' TERM HUP INT; sleep 300 & setsid sleep 300 & : > ../../../at; wait; wait"
-"""An external program that does not listen, with two of its own."""
+"""An external program that ignores signals, with two child processes."""
 
 HELD_FILE = {
-    "planning": "plan.json",
     "writing": "result.json",
-    "collecting": "sweep.json",
     "drawing": "sweep_debug.png",
 }
-"""Stage -> file that lies there whole, and has not got its name yet."""
+"""Stage -> file that is complete but not renamed yet."""
 
 
 def stage() -> str:

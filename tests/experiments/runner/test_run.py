@@ -1,19 +1,15 @@
 """The application: from the command line to its files, messages and exit status."""
 
-import json
 import sqlite3
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from experiments import cli
 from experiments.common.records.record import read_record
 from mvest.closure.model import ClosureModel
-from mvest.errors import InputError
 from mvest.estimation import Prediction
 from mvest.files import PREFIX
 from tests.places import ROOT
@@ -73,74 +69,37 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
 
 
 ERRORS = [
-    ("experiment=nope", "Could not find 'experiment/nope'; known: calibration"),
     ("experiment=tabel1", "Could not find 'experiment/tabel1'; did you mean table1? known: "),
-    ("mesh=huge", "Could not find 'mesh/huge'; known: coarse"),
     ("mesh/nope=a", "Key 'mesh/nope'"),
     ("filter.inital=[1,2]", "did you mean initial?"),
-    ("mechanics.elment=tet4", "did you mean element?"),
-    ("mechanics.protocol.dts=1", "mechanics.protocol.dts"),
     ("sed=3", "did you mean seed?"),
     ("seed=abc", "seed: Value 'abc' of type 'str' could not be converted to Integer"),
-    ("mesh.columns=many", "mesh.columns: Value 'many'"),
     ("observation.noise_mm=[1]", "observation.noise_mm"),
     ("filter=[", "filter=[: no viable alternative"),
-    ("mechanics.protocol.dt=0", "mechanics.protocol.dt = 0, expected 1e-05 to 10 s"),
-    ("truth.dt_factor=0", "truth.dt_factor = 0, expected 0.001 to 100"),
-    ("truth.refine=0", "truth.refine = 0"),
     ("truth.values=[1]", "truth.values has 1 values"),
     ("truth.values=[-1,2]", "truth.values of E_f.anterior = -1, expected 1e-06 to"),
-    ("filter.initial=[1,2,3]", "filter.initial has 3 values"),
-    ("filter.initial=[0,2]", "filter.initial of E_f.anterior = 0, expected"),
-    ("filter.P0=-1", "filter.P0 = -1: the variance has a negative variance"),
-    ("filter.P0=[[1,2],[3,4]]", "must be symmetric"),
     ("filter.P0=[[1,2],[2,1]]", "positive semi-definite"),
     ("filter.P0=much", "filter.P0 = 'much', expected a number"),
-    ("filter.R=0", "filter.R = 0: variance in R is 0, expected > 0"),
     ("filter.R=[1,2,3]", "R has shape (3,)"),
-    ("filter=magic", "Could not find 'filter/magic'; known: "),
-    ("filter.transform=exp", "filter.transform = 'exp'"),
     ("filter.method.tolerance=0", "filter tolerance = 0"),
-    ("filter.method.max_iterations=0", "max_iterations = 0"),
-    ("observation.noise_mm=-1", "observation.noise_mm = -1, expected 0 to 1000 mm"),
     ("observation.frames=[shut]", "observed frames ['shut']"),
     ("observation.columns=7", "valve of 7 x 7 vertices"),
     ("mechanics.element=hex99", "hex99"),
-    ("mechanics.support=glue", "annulus support 'glue'"),
     ("mechanics.solver=magic", "unknown linear solver 'magic'"),
-    ("mechanics.reading=D", "reading = 'D', expected one of A, C"),
-    ("mechanics.tissue.anterior.ratio=-1", "mechanics.tissue.anterior.ratio = -1, expected"),
-    ("mesh.rows=0", "mesh.rows = 0, expected 1 to 60"),
     ("mesh.source=clay", "mesh.source = 'clay', expected structured or tetwild"),
     ("mesh=unstructured", "an unstructured mesh needs tet10 or tet4"),
     ("valve.leaflets.edge_thinning=0", "template leaflets.edge_thinning = 0.0"),
-    ("valve.leaflets.anterior.length=3", "leaflet at phi"),
     ("parameters=[E_f.middle,E_f.posterior]", "parameter 'E_f.middle': unknown 'middle'"),
-    ("parameters=[E_f.anterior,luck]", "unknown parameter 'luck'"),
-    ("seed=-1", "seed = -1, expected 0 to 4294967295"),
-    ("time_limit_s=1e12", "time_limit_s = 1e+12, expected 0.01 to 2592000 s"),
     ("mesh.columns=100000", "mesh.columns = 100000, expected 1 to 400"),
-    ("mechanics.protocol.pressure_mmHg=1e6", "pressure_mmHg = 1000000, expected -100 to 500 mmHg"),
-    ("truth.values=[1e9,2]", "truth.values of E_f.anterior = 1000000000, expected"),
     ("mechanics.density=nan", "mechanics.density is nan"),
     ("study=magic", "Could not find 'study/magic'; known: case"),
     ("hydra.run.dir=file/below", "file/below: Not a directory"),
-    ("paths.outputs=file", "file"),
     ("tracking.uri=postgresql://me:secret@localhost/mvest", "tracking.uri holds a password"),
-    ("sweep=nope", "Could not find 'sweep/nope'; known: "),
-    ("sweep.size=full", "sweep.size"),
-    ("time_limit_s=soon", "time_limit_s: Value 'soon'"),
-    ("force=perhaps", "force: Value 'perhaps'"),
-    ("filter=null", "filter=null: "),
     ("mesh=null", "mesh=null: "),
     ("~filter", "filter.initial has no value"),
-    ("~seed", "seed has no value"),
     ("--experiment", "unrecognized arguments: --experiment; settings are NAME=VALUE"),
     ("name=../escape", "name = '../escape', expected a name"),
-    ("name=.hidden", "name = '.hidden', expected a name"),
-    ("table=deeper/table", "table = 'deeper/table', expected a name"),
     ("+sweep.name=../escape", "sweep.name = '../escape', expected a name"),
-    ("name='a\x07b'", "expected a name"),
     ("hydra.run.dir=${paths.outputs}/${name}/x name=..", "expected a name"),
 ]  # fmt: skip
 
@@ -200,30 +159,6 @@ def test_a_failing_forward_run_is_recorded(run, tmp_path, instead_of_closing) ->
         assert database.execute("select status from runs").fetchall() == [("FAILED",)]
 
 
-def test_a_model_that_fails_on_the_way_is_recorded(run, tmp_path, instead_of_closing) -> None:
-    def breaks(m, rest) -> Prediction:
-        at_start = m[0] == pytest.approx(5.0, rel=1e-12)
-        return Prediction.failed("it buckled") if at_start else shrinking(m, rest)
-
-    instead_of_closing(breaks)
-    status, _, err = run("experiment=debug", "hydra.run.dir=here", "tracking.enabled=false")
-    assert status == 1
-    assert "it buckled" in err
-    record = read_record(tmp_path / "here" / "result.json")
-    assert record.forward_solves == 1
-    (first,) = record.estimates
-    assert first.unknowns[0].estimate is None
-    (start,) = first.iterates
-    assert start == pytest.approx((5.0, 3.0), rel=1e-12)
-
-
-def test_the_papers_element_says_what_is_wrong_with_it(run, instead_of_closing) -> None:
-    instead_of_closing(shrinking)
-    status, _, err = run("experiment=debug", "mechanics.element=tet4", "tracking.enabled=false")
-    assert status == 0
-    assert err.startswith("note: linear tetrahedra")
-
-
 def test_an_interruption_leaves_nothing_behind(run, tmp_path, instead_of_closing) -> None:
     def interrupted(m, rest):
         raise KeyboardInterrupt
@@ -237,14 +172,6 @@ def test_an_interruption_leaves_nothing_behind(run, tmp_path, instead_of_closing
     # Whose turn it was to simulate the truth is all that is known of it.
     left = [path for path in (tmp_path / "outputs").rglob("*") if path.is_file()]
     assert [path.suffix for path in left] == [".lock"]
-
-
-def test_an_untracked_result_survives_a_broken_store(run, tmp_path, instead_of_closing) -> None:
-    instead_of_closing(shrinking)
-    status, _, err = run("experiment=debug", "hydra.run.dir=here", "tracking.uri=nonsense://place")
-    assert status == 0
-    assert "warning: tracking store nonsense://place" in err
-    assert (tmp_path / "here" / "result.json").exists()
 
 
 def test_results_are_renewed_by_the_experiment_as_configured_only(
@@ -275,54 +202,8 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
     assert again == kept
 
 
-def test_a_finished_run_is_told_again_and_not_repeated(run, tmp_path, instead_of_closing) -> None:
-    calls = []
-
-    def counted(m, rest) -> Prediction:
-        calls.append(m)
-        return shrinking(m, rest)
-
-    instead_of_closing(counted)
-    usual = ("experiment=debug", "tracking.enabled=false")
-    status, first, err = run(*usual)
-    assert status == 0, err
-    (folder,) = (tmp_path / "outputs" / "debug").iterdir()
-    assert (folder / "done").exists()
-    once = len(calls)
-    status, again, _ = run(*usual)
-    assert (status, len(calls)) == (0, once)
-    assert "force=true runs it again" in again
-    assert again.splitlines()[:5] == first.splitlines()[:5]
-    assert run(*usual, "force=true")[0] == 0
-    assert len(calls) > once
-
-
-def test_a_forced_run_that_is_interrupted_leaves_the_former_result(
-    run, tmp_path, instead_of_closing
-) -> None:
-    def interrupted(m, rest) -> Prediction:
-        raise KeyboardInterrupt
-
-    usual = ("experiment=debug", "tracking.enabled=false", "hydra.run.dir=here")
-    instead_of_closing(shrinking)
-    assert run(*usual)[0] == 0
-    places = [tmp_path / "here" / name for name in ("result.json", "done", "fields.npz")]
-    before = [place.read_bytes() for place in places]
-    instead_of_closing(interrupted)
-    assert run(*usual, "force=true")[0] == 130
-    assert [place.read_bytes() for place in places] == before
-    status, out, _ = run(*usual)
-    assert status == 0
-    assert "force=true runs it again" in out
-    overrides = (tmp_path / "here" / ".hydra" / "overrides.yaml").read_text()
-    assert yaml.safe_load(overrides) == [*usual[:2], "force=true"]
-
-
 FAILURES = {
     "figure": ("matplotlib.figure.Figure.savefig", ValueError("no glyph for U+D800")),
-    "table": ("pandas.DataFrame.to_csv", RuntimeError("quotes\nare open")),
-    "page": ("mvest.reporting.tables.markdown_rows", KeyError("name")),
-    "words": ("mvest.reporting.tables.Table.text", "a\ud800".encode),
     "marker": (
         "experiments.runner.job.mark_done",
         OSError(28, "No space left on device"),
@@ -364,35 +245,6 @@ def test_an_estimate_outlives_what_cannot_be_written_after_it(
     assert {"debug.csv", "debug.md", "debug.png"} <= {p.name for p in (tmp_path / "here").iterdir()}
 
 
-def test_results_that_could_not_be_renewed_are_renewed_by_the_same_command(
-    run, instead_of_closing, monkeypatch
-) -> None:
-    instead_of_closing(shrinking)
-    elsewhere = ("tracking.enabled=false", "paths.results=published", "hydra.run.dir=here")
-    usual = ("experiment=table1", *elsewhere)
-
-    def damaged(*_):
-        raise InputError("records are damaged")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("experiments.results.published.publish", damaged)
-        status, _, err = run(*usual)
-    assert (status, err.splitlines()[-1]) == (2, "error: records are damaged")
-    status, out, _ = run(*usual)
-    assert status == 0
-    assert "force=true runs it again" in out
-    assert Path("published/table1.csv").exists()
-
-
-def test_another_configurations_result_in_the_folder_is_not_taken(run, instead_of_closing) -> None:
-    instead_of_closing(shrinking)
-    usual = ("experiment=debug", "tracking.enabled=false", "hydra.run.dir=here")
-    assert run(*usual)[0] == 0
-    _, out, _ = run(*usual, "seed=2")
-    assert "force=true" not in out
-    assert json.loads(Path("here/result.json").read_text())["provenance"]["seed"] == 2
-
-
 def test_a_dry_run_writes_nothing(run, tmp_path) -> None:
     status, out, err = run("experiment=debug", "dry_run=true")
     assert status == 0, err
@@ -402,33 +254,3 @@ def test_a_dry_run_writes_nothing(run, tmp_path) -> None:
     status, out, err = run("experiment=debug", "dry_run=true", "filter.P0=-1")
     assert (status, out) == (2, "")
     assert "filter.P0 = -1" in err
-
-
-def test_tables_without_records_say_what_to_do(tmp_path, capsys) -> None:
-    assert cli.main(["tables", str(tmp_path)]) == 2
-    assert "experiment=table1" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="2"):
-        cli.main(["tables", "a", "b"])
-    assert capsys.readouterr().err.startswith("error: ")
-
-
-@pytest.mark.slow
-def test_a_sweep_runs_in_workers_and_logs_to_one_store(tmp_path) -> None:
-    finished = subprocess.run(
-        [
-            *(sys.executable, "-m", "experiments.run", "--multirun", "experiment=debug"),
-            *("seed=1,2", "hydra.launcher.n_jobs=2"),
-        ],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=600,
-    )
-    assert finished.returncode == 0, finished.stderr
-    assert len(list((tmp_path / "outputs" / "debug").glob("*/result.json"))) == 2
-    with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
-        whole = database.execute("select run_uuid from tags where key = 'sweep_id'").fetchall()
-        of_jobs = "select value from tags where key = 'mlflow.parentRunId'"
-        assert database.execute(of_jobs).fetchall() == whole * 2

@@ -7,7 +7,6 @@ import os
 import re
 import resource
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,6 @@ from experiments.runner.plan import Plan
 from experiments.studies import twin
 from experiments.sweeps.collected import Sweep, read_sweep
 from mvest.files import sha256_of
-from tests.places import ROOT
 
 QUICK = ("hydra.launcher.n_jobs=1", "tracking.enabled=false")
 
@@ -134,52 +132,9 @@ def test_a_dry_run_lists_what_would_run_and_touches_nothing(run):
     run("sweep=debug")
     _, out, _ = run("sweep=debug", "dry_run=true")
     assert out.count("  done  ") == 3
-    assert "seed=2  [failed before: RuntimeError: it broke]" in out
+    assert "seed=2 [failed before: RuntimeError: it broke]" in " ".join(out.split())
     assert "about " in out
     assert len(runs()) == 4
-
-
-@pytest.mark.parametrize("broken", ["make_plan", "require_admissible", "run_jobs"])
-def test_nothing_is_launched_after_a_mistake_of_ours(run, monkeypatch, broken):
-    def fail(*_):
-        raise ZeroDivisionError("a mistake")
-
-    monkeypatch.setattr(sweep, broken, fail)
-    with pytest.raises(ZeroDivisionError):
-        run("sweep=debug")
-    assert runs() == []
-    assert not list(Path().rglob("result.json"))
-
-
-def test_a_sweep_may_be_the_union_of_grids(run):
-    status, out, _ = run("sweep=debug", "sweep.size=full", "dry_run=true")
-    assert status == 0
-    assert "5 jobs" in out
-    # What the command line says holds for every grid.
-    _, out, _ = run("sweep=debug", "sweep.size=full", "dry_run=true", "filter.initial=[9,9],[1,1]")
-    assert out.count("start_anterior=9.0") == 3
-
-
-def test_a_sweep_from_the_command_line_is_planned_as_well(run):
-    status, out, _ = run("-m", "experiment=debug", "seed=1,2,3")
-    assert status == 0
-    found = read_sweep(Path("outputs/debug/sweep.json"))
-    assert (found.name, found.size) == ("debug", None)
-    assert [record.estimates[0].seed for record in found.records] == [1, 2, 3]
-    _, out, _ = run("-m", "experiment=debug", "seed=1,2,3,4")
-    assert "3 done, 0 failed before, 1 to run" in out
-
-
-def test_any_number_of_workers_gives_the_same_files(run):
-    for workers in ("1", "3"):
-        outputs = (f"paths.outputs=with-{workers}", f"hydra.launcher.n_jobs={workers}")
-        assert run("sweep=debug", "publish=true", *outputs)[0] == 0
-    one, three = (
-        {path.name: path.read_bytes() for path in Path(f"with-{n}/results").glob("*.*")}
-        for n in (1, 3)
-    )
-    assert one == three
-    assert {"sweep_debug.csv", "sweep_debug.md", "sweep_debug.png"} <= one.keys()
 
 
 def test_a_job_returns_its_objective(run, monkeypatch):
@@ -233,47 +188,6 @@ def test_jobs_may_come_in_several_batches(run, monkeypatch):
     assert "objective = no_such_number: a job has no such number" in err
 
 
-def test_the_folders_of_jobs_may_be_named_otherwise(run):
-    named = ("-m", "experiment=debug", "seed=1,2", "hydra.sweep.subdir=job-${hydra.job.num}")
-    assert run(*named)[0] == 0
-    assert {path.parent.name for path in Path("outputs").rglob("done")} == {"job-0", "job-1"}
-    status, out, _ = run(*named)
-    assert status == 0
-    assert "nothing left" in out
-    overrides = Path("outputs/debug/job-1/.hydra/overrides.yaml").read_text()
-    assert "seed=2" in yaml.safe_load(overrides)
-    status, _, err = run(*named[:3], "hydra.sweep.subdir=one")
-    assert status == 2
-    assert "two jobs have one folder, outputs/debug/one: " in err
-    assert len(runs()) == 2
-
-
-def test_a_sweep_s_own_grids_are_not_left_out_by_another_sweeper(run):
-    status, _, err = run("sweep=debug", "hydra/sweeper=basic", "publish=true")
-    assert (status, err.count("\n"), runs()) == (2, 1, [])
-    assert "hydra/sweeper=basic" in err
-
-
-def test_a_cluster_s_package_takes_no_signals_away():
-    code = """
-import signal
-from experiments.runner.cluster import EngineSettings, require_engine
-before = signal.getsignal(signal.SIGINT)
-require_engine(EngineSettings(cluster="SLURMCluster"))
-assert signal.getsignal(signal.SIGINT) is before
-"""
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
-
-
-def test_jobs_of_earlier_batches_are_part_of_the_sweep(run):
-    asked = ("hydra/sweeper=basic", "hydra.sweeper.max_batch_size=1")
-    for forced, count in ((), 2), (("force=true",), 4):
-        status, _, err = run("-m", "experiment=debug", "seed=1,2", *asked, *forced)
-        assert status == 0, err
-        assert all(one.converged for one in read_sweep(Path("outputs/debug/sweep.json")).records)
-        assert len(runs()) == count
-
-
 def test_results_are_renewed_by_a_sweep_as_configured_only(run):
     _, out, _ = run("sweep=debug", "publish=true", "filter.method.tolerance=1e-3")
     assert "left as it is" in out
@@ -313,21 +227,20 @@ WRONG = [
         ("sweep=debug", "hydra.launcher.cluster=LocalCluster", "hydra.launcher.address=tcp://a:1"),
         "hydra.launcher: address and cluster, expected one of them",
     ),
-    (("sweep=nope",), "Could not find 'sweep/nope'; known: "),
     (("sweep=debug", "sweep.size=huge"), "sweep.size = 'huge', expected one of small, full"),
-    (("sweep=debug", "sweep.sise=full"), "did you mean size?"),
     (("sweep=debug", "sed=1,2"), "did you mean seed?"),
-    (("sweep=debug", "mesh=coarse,huge"), "Could not find 'mesh/huge'; known: coarse"),
-    (("sweep=debug", "seed=1,many"), "seed: Value 'many'"),
-    (("sweep=debug", "filter.P0=0.01,-1"), "filter.P0 = -1: the variance has a negative variance"),
-    (("sweep=debug", "time_limit_s=0"), "time_limit_s = 0, expected 0.01 to"),
-    (("sweep=debug", "seed=1,1"), "two jobs are one and the same: "),
     (("sweep=debug", "seed=interval(1,2)"), "does not support sweep type"),
-    (("sweep=debug", "seed=glob(*)"), "seed=glob(*): nothing to choose from"),
     (("sweep=debug", "hydra.launcher.cluster=PBS"), "hydra.launcher.cluster = PBS, expected"),
-    (("sweep=debug", "hydra.launcher.jobs=0"), "hydra.launcher.jobs = 0, expected 1"),
     (("sweep=debug", "paths.outputs=file"), "file"),
+    (("sweep=debug", "filter.P0=0.01,-1"), "(job filter.initial=[5,3] seed=1 "),
+    (("sweep=debug", "filter.initial=[5,3],[5.0,3.0]"), "one and the same: filter.initial=[5,3]"),
 ]  # fmt: skip
+
+
+def test_another_sweeper_does_not_ignore_the_grids_of_a_sweep(run):
+    status, _, err = run("sweep=debug", "hydra/sweeper=basic")
+    assert (status, err.count("\n"), runs()) == (2, 1, [])
+    assert "hydra/sweeper=basic knows no grid" in err
 
 
 @pytest.mark.parametrize(("overrides", "words"), WRONG, ids=[" ".join(o) for o, _ in WRONG])
@@ -342,18 +255,6 @@ def test_a_wrong_sweep_is_one_clear_line_and_launches_nothing(run, overrides, wo
     assert [path.name for path in Path().rglob("*")] == ["file"], "not even an empty folder"
 
 
-def test_a_wrong_job_is_named(run):
-    _, _, err = run("sweep=debug", "filter.P0=0.01,-1")
-    assert "filter.initial=[5,3]" in err
-    assert "filter.P0=-1" in err
-
-
-def test_equal_jobs_are_both_named(run):
-    _, _, err = run("sweep=debug", "filter.initial=[5,3],[5.0,3.0]")
-    assert "filter.initial=[5,3]" in err
-    assert "filter.initial=[5.0,3.0]" in err
-
-
 def test_a_full_disk_is_a_clear_error_and_leaves_no_half_file(run, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -365,14 +266,6 @@ def test_a_full_disk_is_a_clear_error_and_leaves_no_half_file(run, monkeypatch):
     assert "plan.json: No space left on device" in err
     assert len(err.splitlines()) == 1
     assert not list(Path().iterdir())
-
-
-def test_a_disk_that_fills_up_within_a_job_costs_its_row(run):
-    Path("full-2").touch()
-    status, _, err = run("sweep=debug")
-    assert status == 1
-    assert err.count("No space left on device") == 1
-    assert "result.json: No space left on device" in collected().records[1].reason
 
 
 def test_a_sweep_that_cannot_go_on_says_so_in_a_line_and_can_be_resumed(run, monkeypatch):
@@ -442,7 +335,7 @@ def test_a_run_by_itself_is_held_to_its_memory(run, monkeypatch):
 
 @pytest.mark.parametrize(
     ("given", "limit"),
-    [((), 14_400.0), (("time_limit_s=60",), 60.0), (("time_limit_s=null",), None)],
+    [((), 14_400.0), (("time_limit_s=null",), None)],
 )
 def test_jobs_of_a_sweep_have_a_time_limit_unless_it_is_taken_away(run, given, limit):
     status, _, err = run("sweep=debug", "detach=true", *given)

@@ -8,7 +8,6 @@ import pytest
 from experiments.common.records.record import read_record
 from experiments.run import main
 from experiments.studies import cycle
-from mvest.errors import InputError
 
 TINY = (
     "mesh.columns=8",
@@ -88,28 +87,6 @@ def test_an_estimate_from_another_mesh_says_what_its_own_may_have_done(done):
         assert other.std > one.std
 
 
-def test_a_mesh_on_which_nothing_closes_is_said_and_not_raised(done, monkeypatch):
-    original = cycle._on_mesh
-
-    def lost(values, settings, mesh):
-        found = original(values, settings, mesh)
-        if mesh == settings.check:
-            object.__setattr__(found, "closure", None)
-        return found
-
-    def frames(self, m):
-        if self.closure is None:
-            raise InputError("no cycle")
-        return unpatched(self, m)
-
-    unpatched = cycle.CycleModel.frames
-    monkeypatch.setattr(cycle, "_on_mesh", lost)
-    monkeypatch.setattr(cycle.CycleModel, "frames", frames)
-    record, _, _ = done("experiment=joint", *SHORT, "cycle.estimated=[another mesh]")
-    assert record.numbers["check_mesh"] == "no cycle"
-    assert {one.case for one in record.estimates} == {"another mesh"}
-
-
 def test_the_cycle_study_compares_frames_and_time_steps(done):
     record, folder, _ = done(
         "experiment=cycle", "cycle.time_steps=[0.05,0.025,0.0125]", "cycle.path_steps=4"
@@ -126,21 +103,6 @@ def test_the_cycle_study_compares_frames_and_time_steps(done):
     assert max(row["unevenness"] for row in steps) < 1.5
     assert not record.estimates
     assert {"cycle.csv", "cycle_time_steps.csv", "cycle.png"} <= {p.name for p in folder.iterdir()}
-
-
-def test_every_chordal_family_is_estimated_from_both_sets_of_frames(done):
-    record, _, _ = done(
-        "experiment=chord", "truth.values=[6,2,0.9,1.1,0.97,0.97]", "cycle.noise_mm=0.05"
-    )
-    first, second = (
-        estimate_of(record, label).parameters
-        for label in ("open and closed", "whole cycle, errors 1")
-    )
-    two, whole = (np.array([u.std / u.estimate for u in each]) for each in (first, second))
-    prior = np.array([u.prior_std / u.prior_mean for u in first])
-    # Data never widen the posterior by more than its change of place, and more data tell more.
-    assert np.all(two < 1.2 * prior)
-    assert np.sum(np.log(whole)) < np.sum(np.log(two))
 
 
 def test_what_cannot_be_estimated_is_refused(run_here):

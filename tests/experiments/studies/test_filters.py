@@ -26,9 +26,7 @@ NAMES = ("E_f.anterior", "E_f.posterior")
     ("name", "overrides", "expected"),
     [
         ("extended", [], ExtendedFilter()),
-        ("unscented", ["filter.method.max_iterations=1"], UnscentedFilter(1e-3, 1)),
         ("unscented", ["filter.method.spread=0.5"], UnscentedFilter(1e-3, 15, 0.5)),
-        ("ensemble", ["+filter.method.seed=5"], EnsembleFilter(24, 1, "square_root", 5)),
         ("ensemble_smoother", [], EnsembleFilter(24, 4)),
         ("importance", ["+filter.method.runs=40"], ImportanceFilter(runs=40)),
     ],

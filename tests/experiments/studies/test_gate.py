@@ -19,7 +19,7 @@ from mvest.closure.smoothness import JUMP_LIMIT
 from mvest.estimation import Prediction
 from mvest.reporting.tables import table
 from tests.experiments.configured import composed, plain
-from tests.places import ANATOMIES, CONF
+from tests.places import ANATOMIES
 
 SMALL = (
     "mesh.columns=12",
@@ -89,14 +89,7 @@ def test_a_verdict_is_looked_up_by_the_anatomy_and_not_by_its_name(tmp_path):
     assert gate_of(settings("template", "mesh.columns=40"), path).startswith("passed")
     wider = settings("template", "valve.annulus.anteroposterior_half_axis=15.0")
     assert gate_of(wider, path) == NOT_GATED
-    assert gate_of(settings("half_open"), path) == NOT_GATED
     assert gate_of(settings("template"), tmp_path / "none") == NOT_GATED
-
-
-def test_every_anatomy_that_ships_is_one_of_those_that_are_asked():
-    asked = CONF.joinpath("experiment", "gate.yaml").read_text(encoding="utf-8")
-    (line,) = (line for line in asked.splitlines() if line.strip().startswith("valve:"))
-    assert sorted(line.partition(":")[2].strip().split(",")) == list(ANATOMIES)
 
 
 def test_kept_verdicts_are_of_the_anatomies_as_they_ship():
@@ -127,8 +120,6 @@ def test_what_has_not_passed_says_so_before_its_results():
     assert passed.caution == none.caution == ""
     assert "did NOT pass the gate (NOT passed on 54 x 6 hex18)" in failed.caution
     assert "experiment=gate" in never.caution
-    assert failed.line.endswith("seed 1; gate of the anatomy: NOT passed on 54 x 6 hex18")
-    assert "gate of" not in none.line
     # Of several, those that it is said of are named.
     assert cautions([failed]) == [failed.caution]
     assert cautions([passed, failed]) == [f"on NOT passed on 54 x 6 hex18: {failed.caution}"]
@@ -137,7 +128,6 @@ def test_what_has_not_passed_says_so_before_its_results():
 
 def test_each_case_changes_its_own_setting_only():
     config = plain(composed("experiment=gate", "mesh.columns=12", "mesh.rows=2"))
-    base = closure_model(config)
 
     def described(model: ClosureModel) -> dict:
         settings = model.settings
@@ -148,34 +138,18 @@ def test_each_case_changes_its_own_setting_only():
             "activation": settings.contact.activation_distance,
             "sampling": len(model.contact_valve.surface.vertices),
             "mesh": model.mesh.sha256,
-            "guided": model.guide is not None,
             "perturbed": None if model.perturbation is None else float(model.perturbation.sum()),
             "start": model.continuation,
             "rest": (settings.tissue, settings.damping, model.names),
-            "observed": model.valve.surface.vertices.shape,
         }
 
-    reference = described(base)
-    changed = {}
+    reference, usual = described(closure_model(config)), GateCase("x")
     for case in GATE_CASES:
         varied = described(closure_model(config, case))
-        changed[case.name] = {k for k, v in varied.items() if v != reference[k]}
-    unchanged = GateCase("x")
-    for case in GATE_CASES:
-        asked = {k for k in unchanged.__slots__ if getattr(case, k) != getattr(unchanged, k)} - {
-            "name"
-        }
+        changed = {key for key, value in varied.items() if value != reference[key]}
+        slots = {k for k in usual.__slots__ if getattr(case, k) != getattr(usual, k)}
         # No mesh is coarser than that of 24 x 3 cells which guides are on.
-        assert changed[case.name] == asked - {"guided"}
-    (finer,) = (closure_model(config, c).mesh for c in GATE_CASES if c.mesh != 1)
-    assert len(finer.elements) == 18 * 3
-    (guided,) = (c for c in GATE_CASES if c.guided)
-    usual = plain(composed("experiment=gate"))
-    assert closure_model(usual).guide is None
-    assert len(closure_model(usual, guided).guide.mesh.elements) < 54 * 6
-    assert closure_model(config, GATE_CASES[0]).settings.protocol.dt == pytest.approx(
-        0.5 * reference["dt"]
-    )
+        assert changed == slots - {"name", "guided"}
 
 
 def test_the_gate_study_records_every_case(run):
@@ -206,21 +180,6 @@ def test_a_reference_that_does_not_close_is_recorded_as_a_failure(run, monkeypat
     (reference,) = record.table_of("variations").rows
     assert (reference["variation"], reference["reason"]) == ("reference", "it buckled")
     assert "it buckled" in said.err
-
-
-def test_a_case_that_does_not_close_has_no_distance(run, monkeypatch):
-    true = ClosureModel.__call__
-
-    def sometimes(self, m):
-        return Prediction.failed("it buckled") if len(self.mesh.elements) > 24 else true(self, m)
-
-    monkeypatch.setattr(ClosureModel, "__call__", sometimes)
-    status, record, _, _ = run("experiment=gate", *ONE)
-    assert status == 0
-    rows = {row["variation"]: row for row in record.table_of("variations").rows}
-    assert rows["mesh x 1.5"]["mean"] is None
-    assert (rows["mesh x 1.5"]["passed"], rows["mesh x 1.5"]["reason"]) == (False, "it buckled")
-    assert record.numbers["passed"] is False
 
 
 def test_the_closure_study_measures_every_step(run):

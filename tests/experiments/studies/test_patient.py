@@ -9,17 +9,16 @@ import pytest
 from experiments.common.building import patient_store
 from experiments.common.cases.blind import SECRET, read_estimate, write_estimate
 from experiments.common.cases.own_case import PersonalSettings, read_configured, run_case
-from experiments.common.records.record import NOT_GATED, stamp
+from experiments.common.records.record import stamp
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.patient import study as patient
-from experiments.studies.patient.study import Settings, check_patient, reveal, run_patient
+from experiments.studies.patient.study import Settings, reveal, run_patient
 from mvest.cases.folder import read_case
-from mvest.errors import ConfigurationError, GeometryError, InputError
+from mvest.errors import GeometryError
 from mvest.problem.verdict import ONE_STATE
 from mvest.simulation.virtual_patient import PatientSettings, VirtualPatient
 from tests.experiments.configured import composed, plain
-from tests.experiments.studies.made_up_patients import a_result
 from tests.made_up_closure import TRUE, made_up_case, use
 
 
@@ -105,16 +104,12 @@ def test_a_patient_is_simulated_once(tmp_path, simulated):
     assert not (place.case / "rest.txt").exists()
 
 
-def test_the_case_and_the_truth_lie_apart(tmp_path, simulated):
+def test_a_case_does_not_contain_its_truth(tmp_path, simulated):
     place = make_patient(config_of(tmp_path))
     hidden = json.loads((place.hidden / "hidden.json").read_text())
     assert hidden["values"] == TRUE
-    assert place.case.parent == place.hidden.parent
     text = b"".join(p.read_bytes() for p in place.case.rglob("*") if p.is_file()).decode("latin-1")
-    for name, value in TRUE.items():
-        assert name not in text, name
-        # Short values may occur by chance; the moduli of the configuration must not.
-        assert json.dumps({name: value})[1:-1] not in text
+    assert not [name for name in TRUE if name in text]
     assert "normal_small" not in {p.name for p in place.case.rglob("*")}
 
 
@@ -124,14 +119,14 @@ def test_moduli_are_those_of_the_configuration_or_drawn_about_them(tmp_path, sim
     assert (values["E_f.anterior"], values["E_f.posterior"]) == (6.28, 2.61)
     draws = []
     config = config_of(tmp_path, "patient=drawn", "patient.variation=0")
-    for seed in range(1, 41):
+    for seed in range(1, 21):
         make_patient(config | {"seed": seed})
         draws.append([simulated[-1][3][f"E_f.{r}"] for r in ("anterior", "posterior")])
     logs = np.log(np.array(draws) / [6.23, 2.09])
-    # Forty draws of 0.4: a standard error of 0.063 of the mean and 0.045 of the spread.
-    assert np.abs(logs.mean(axis=0)).max() < 4 * 0.063
-    assert np.abs(logs.std(axis=0) - 0.4).max() < 4 * 0.045
-    assert abs(np.corrcoef(logs.T)[0, 1]) < 0.6
+    # Twenty draws of 0.4: a standard error of 0.089 of the mean and 0.063 of the spread.
+    assert np.abs(logs.mean(axis=0)).max() < 4 * 0.089
+    assert np.abs(logs.std(axis=0) - 0.4).max() < 4 * 0.063
+    assert abs(np.corrcoef(logs.T)[0, 1]) < 0.8
 
 
 def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
@@ -147,22 +142,18 @@ def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
     place = make_patient(config_of(tmp_path, "patient=drawn", "seed=7"))
     assert len(set(map(repr, shapes))) == 3
     assert json.loads((place.hidden / "hidden.json").read_text())["anatomies_drawn"] == 3
-    # An anatomy that is given is not exchanged for another one, and draws come to an end.
+
+    # A given anatomy is not replaced, and draws come to an end.
+    def fails(*arguments):
+        shapes.append(arguments)
+        raise GeometryError("does not close")
+
+    monkeypatch.setattr(patient_store, "simulate_patient", fails)
     for overrides, tries in (("patient=drawn", 5), ("patient=prolapse", 1)):
         shapes.clear()
-        monkeypatch.setattr(
-            patient_store,
-            "simulate_patient",
-            lambda *a: shapes.append(a) or (_ for _ in ()).throw(GeometryError("does not close")),
-        )
         with pytest.raises(GeometryError, match="does not close"):
             make_patient(config_of(tmp_path, overrides, "seed=8"))
         assert len(shapes) == tries
-
-
-def test_a_study_of_patients_needs_one():
-    with pytest.raises(ConfigurationError, match="patient is not given"):
-        patient_store.make_patient({}, None)
 
 
 def test_nothing_is_revealed_before_the_estimation_has_ended(
@@ -195,9 +186,7 @@ def test_nothing_is_revealed_before_the_estimation_has_ended(
     ]
     for key in ("iterates", "objective", "verdict", "innovation"):
         assert json.loads(estimate.model_dump_json())[key] == before[key]
-    assert stamp(values, "hash", result, 0.0).provenance.seed == 1
-    numbers = result.numbers
-    assert (numbers["paper_generic_mm"], numbers["paper_personalised_mm"]) == (1.5, 1.47)
+    assert result.numbers["paper_generic_mm"] == 1.5
 
 
 def leaves(value):
@@ -215,13 +204,9 @@ def test_what_is_revealed_is_right(tmp_path, out, simulated, in_process, monkeyp
     assert result.gate == "NOT passed on 54 x 6 hex18"
     assert ONE_STATE in [failed.check for failed in estimate.verdict.failed_checks]
     assert (result.status, estimate.seed) == ("converged", 1)
-    assert result.numbers["anatomies_drawn"] == 1
     for row in estimate.parameters:
         assert row.truth == TRUE[row.name]
         assert row.inside is (row.low <= row.truth <= row.high)
-    for other in estimate.alternatives.values():
-        assert [row.truth for row in other.moduli] == [5.1, 2.6]
-        assert all(isinstance(row.inside, bool) for row in other.moduli)
     # Nuisances are far off here, so that an estimation without them is wrong and sure of it.
     assert not all(row.inside for row in estimate.alternatives["moduli_only"].moduli)
     for region, true in (("anterior", 5.1), ("posterior", 2.6)):
@@ -244,17 +229,6 @@ def test_what_is_revealed_is_right(tmp_path, out, simulated, in_process, monkeyp
     assert 0.0 < result.numbers["nees"] < 100.0
 
 
-def test_revealing_leaves_what_it_was_given(tmp_path, out, simulated, in_process):
-    values = config_of(tmp_path)
-    place = make_patient(values)
-    estimated = patient.estimate_blindly(values, out, place.case, place.hidden, NOT_GATED)
-    before, names = estimated.estimates[0].model_dump_json(), set(estimated.arrays)
-    revealed = reveal(estimated, place, settings_in(values), 1)
-    assert estimated.estimates[0].model_dump_json() == before
-    assert set(estimated.arrays) == names
-    assert [row.truth for row in revealed.estimates[0].unknowns[:2]] == [5.1, 2.6]
-
-
 def test_a_failed_estimation_is_revealed_too(tmp_path, out, simulated, in_process, monkeypatch):
     use(monkeypatch, fails_above=4.0)
     values = config_of(tmp_path)
@@ -266,14 +240,6 @@ def test_a_failed_estimation_is_revealed_too(tmp_path, out, simulated, in_proces
     assert result.numbers["nees"] is None
     kept = patient.keep(stamp(values, "hash", result, 0.0))
     assert kept.estimates[0].moduli == result.estimates[0].moduli
-
-
-def test_a_truth_that_is_damaged_is_said(tmp_path, simulated, in_process):
-    values = config_of(tmp_path)
-    place = make_patient(values)
-    (place.hidden / "positions.npz").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="does not hold what a patient hides"):
-        reveal(a_result(5.0, 2.0), place, settings_in(values), 1)
 
 
 SMALLEST = (
@@ -309,15 +275,3 @@ def test_the_estimate_is_the_same_where_there_is_no_truth_to_see(tmp_path):
     one, two = (record.model_copy(update={"seconds": 0.0, "details": {}}) for record in found)
     assert one == two
     assert [row.truth for row in revealed.estimates[0].unknowns[:2]] == [6.28, 2.61]
-
-
-def test_a_check_speaks_of_the_patients_case_and_reveals_nothing(tmp_path, simulated, monkeypatch):
-    use(monkeypatch)
-    said = check_patient(config_of(tmp_path), tmp_path)
-    assert len(simulated) == 1
-    assert (tmp_path / "check.html").is_file()
-    lines = [line.split() for line in said.splitlines() if line.strip().startswith("E_f ")]
-    assert lines
-    # The assumed values are the prior's, not the patient's.
-    assert {float(words[3]) for words in lines if "MPa" in words} == {6.23, 2.09}
-    assert not any(f"{value:g}" in said for value in (6.28, 2.61))

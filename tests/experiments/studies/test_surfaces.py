@@ -20,7 +20,7 @@ from experiments.studies.surfaces import (
 )
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case
-from mvest.errors import ConfigurationError, InputError
+from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, FailedCheck, Verdict
 from mvest.simulation.arrival import ArrivalSettings, arrive
@@ -63,7 +63,6 @@ def laid_out_by(kind):
 @pytest.mark.parametrize(
     ("kind", "corresponds", "opened_mm", "closed_mm"),
     [
-        ("vertices", True, (0.0, 1e-9), (0.05, 0.3)),
         ("surfaces", False, (0.0, 1e-9), (0.0, 1e-9)),
         ("with errors", False, (0.0, 1e-9), (0.05, 0.3)),
         ("slicerheart", False, (0.0, 0.06), (0.0, 0.06)),
@@ -97,22 +96,6 @@ def test_surfaces_arrive_where_they_are(kind, corresponds, opened_mm, closed_mm,
     assert abs(thickness_error(arrived, PATIENT.surface.thickness)) < 0.1
     laid_out = any("laid out" in sentence for sentence in case.derived)
     assert laid_out is laid_out_by(kind)
-
-
-def test_a_door_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(
-        ConfigurationError, match=r"arrival\.kind = 'window', expected one of vertices"
-    ):
-        arrive(
-            PATIENT,
-            CLOSED.vertices,
-            REGISTRATION,
-            ArrivalSettings(kind="window", label=""),
-            tmp_path,
-        )
-    no_voxels = replace(ARRIVALS["labels"], voxel_mm=None)
-    with pytest.raises(ConfigurationError, match=r"arrival\.voxel_mm is not given"):
-        arrive(PATIENT, CLOSED.vertices, REGISTRATION, no_voxels, tmp_path)
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """From a file of a volume to moduli: what the one command does around the detectors.
 
-The detectors are stood for by the valve that is in the volume; they have tests of their own.
+The detectors are replaced by the valve that is in the volume; they have tests of their own.
 """
 
 import json
@@ -13,7 +13,7 @@ import pytest
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.detector_errors import valve_axes
 from mvest.errors import InputError
-from mvest.exchange.segmentations import write_sequence_nrrd
+from mvest.exchange.volumes import write_sequence_nrrd
 from mvest.files import sha256_of
 from mvest.imaging.detection.detect import NoValveError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
@@ -21,21 +21,22 @@ from mvest.imaging.volume import Modality, VolumeSequence
 from tests.cases.from_images.test_imaged_case import LAYOUT, sequence
 
 
+def written(path, times):
+    """A file of noise, which nobody looks at."""
+    rng = np.random.default_rng(1)
+    frames = rng.integers(0, 255, (len(times), 20, 20, 20), dtype=np.uint8)
+    grid = np.full(3, 3.0), np.eye(3), np.full(3, -30.0)
+    return write_sequence_nrrd(path, VolumeSequence(frames, *grid, times, Modality.ULTRASOUND))
+
+
 @pytest.fixture
 def volume(tmp_path):
-    """A file with as many frames as the valve: noise, for no one looks at it."""
-    rng = np.random.default_rng(1)
-    frames = rng.integers(0, 255, (4, 20, 20, 20), dtype=np.uint8)
-    seen = sequence()
-    made = VolumeSequence(
-        frames, np.full(3, 3.0), np.eye(3), np.full(3, -30.0), seen.times, Modality.ULTRASOUND
-    )
-    return write_sequence_nrrd(tmp_path / "my_tee.seq.nrrd", made)
+    return written(tmp_path / "my_tee.seq.nrrd", sequence().times)
 
 
 @pytest.fixture
 def run(run, monkeypatch, volume):
-    """Run the one command: exit status, standard output and error; what detectors were told."""
+    """Run the one command; `found` is detected, or raised, and `told` has the given arguments."""
     rng = np.random.default_rng(2)
     accuracy = DetectionAccuracy(
         np.full(LAYOUT.size, 0.5),
@@ -43,58 +44,28 @@ def run(run, monkeypatch, volume):
         0.05 * rng.standard_normal((20, 2, LAYOUT.size, 3)),
         0.5 * rng.standard_normal((20, 2, 2, 3)),
     )
-    model = SimpleNamespace(
-        accuracy=accuracy,
-        sha256="0" * 64,
-        trained_on={"seed": 1},
-        shape=SimpleNamespace(layout=LAYOUT),
-    )
-    told = []
+    shape = SimpleNamespace(layout=LAYOUT)
+    model = SimpleNamespace(accuracy=accuracy, sha256="0" * 64, trained_on={"seed": 1}, shape=shape)
 
     def detect(volume, given, *, min_confidence, progress=None):
-        assert given is model
-        told.append(volume)
-        return sequence()
+        call.told.append(min_confidence)
+        if isinstance(call.found, NoValveError):
+            raise call.found
+        return call.found
 
     detected = "mvest.cases.from_images.detected"
     monkeypatch.setattr(f"{detected}.load_model", lambda path: model)
     monkeypatch.setattr(f"{detected}.default_model", lambda: model)
     monkeypatch.setattr(f"{detected}.detect_valve", detect)
+    monkeypatch.setattr("mvest.reporting.figures.DPI", 20)
 
     def call(*arguments, pressure=True):
         given = [*arguments, "imaged.pressure_mmHg=110"] if pressure else arguments
         # In this process, where the detectors are replaced.
         return run("experiment=volume", f"volume={volume}", *given, "time_limit_s=null")
 
-    call.told, call.model = told, model
+    call.told, call.model, call.found = [], model, sequence()
     return call
-
-
-@pytest.fixture
-def asked(monkeypatch):
-    """Cases and images that would be personalised."""
-    given = []
-
-    def personalised(values, personal, case, images):
-        given.append((case, images))
-        raise InputError("not tried here")
-
-    monkeypatch.setattr("experiments.common.cases.own_case.run_case", personalised)
-    return given
-
-
-def finds(monkeypatch, found):
-    """Let the detectors find this, or fail with it; what confidence they are told."""
-    told = []
-
-    def detect(volume, model, *, min_confidence, progress=None):
-        told.append(min_confidence)
-        if isinstance(found, NoValveError):
-            raise found
-        return found
-
-    monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", detect)
-    return told
 
 
 def test_the_image_step_is_checked_written_and_drawn(run, volume, tmp_path):
@@ -105,45 +76,38 @@ def test_the_image_step_is_checked_written_and_drawn(run, volume, tmp_path):
                  "images/valve.pvd", "case/case.yaml", "case/errors.npz"):  # fmt: skip
         assert (folder / name).is_file(), name
     case = read_case(folder / "case")
-    # By its content: a file may be called after a patient.
+    # Named by its content: a file may be called after a patient.
     assert case.name == f"volume {sha256_of(volume)[:12]}"
-    named = [
-        path for path in folder.rglob("*") if path.is_file() and b"my_tee" in path.read_bytes()
-    ]
-    assert named == []
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    assert not [path for path in files if b"my_tee" in path.read_bytes()]
     assert not case.simulated
-    assert [frame.name for frame in case.frames] == ["open", "closed"]
-    assert case.frames[1].pressure_mmHg == 110.0
-    # Each also as it would be on the other side.
+    assert [(f.name, f.pressure_mmHg) for f in case.frames] == [("open", 0.0), ("closed", 110.0)]
+    # Each sample also mirrored.
     assert len(case.error_samples) == 40
-    # Near where it was found, less what the detectors are off by on average.
+    # At the detected position minus the mean error of the detectors.
     off = np.linalg.norm(case.surface.vertices - sequence().vertices[0], axis=1)
     mean = np.linalg.norm(run.model.accuracy.samples[:, 0].mean(axis=0), axis=1)
     np.testing.assert_allclose(off, mean, atol=1e-9)
     assert "trained and tested on simulated volumes only" in out
-    assert "chordae: 34 laid out as in the template" in out
-    assert list((folder / "images").glob("valve_*.mrk.json"))
-    # The same again, over what is there.
-    assert run("check=true")[0] == 0
 
 
-def test_what_is_told_of_the_frames_is_taken(run, tmp_path):
+def test_settings_of_the_frames_are_used(run, tmp_path):
+    (tmp_path / "curve.csv").write_text("time,pressure\n0,0\n0.1,96\n0.2,120\n")
     status, _, err = run(
         "check=true", "imaged.open_frame=1", "imaged.closed_frame=2",
-        "imaged.thickness_mm=[1.5,1.1]", "imaged.name=mine",
-        "imaged.simulated=true", "imaged.error_samples=5",
+        "imaged.thickness_mm=[1.5,1.1]", "imaged.name=mine", "imaged.simulated=true",
+        "imaged.error_samples=5", "imaged.pressure_curve=curve.csv",
+        "imaged.min_confidence=0.1", pressure=False,
     )  # fmt: skip
     assert status == 0, err
+    assert run.told == [0.1]
     (case,) = (tmp_path / "outputs" / "volume").glob("*/case")
     case = read_case(case)
-    assert [(f.name, f.pressure_mmHg) for f in case.frames] == [
-        ("open", 0.0), ("closed", 110.0)
-    ]  # fmt: skip
+    assert case.frames[-1].pressure_mmHg == pytest.approx(96.0)
     assert (case.name, case.simulated) == ("mine", True)
     middle = [LAYOUT.column(phi) for phi in (90.0, 270.0)]
     np.testing.assert_allclose(case.surface.thickness[LAYOUT.annulus[middle]], [1.5, 1.1])
     assert case.error_samples.vertices.shape == (10, 2, LAYOUT.size, 3)
-    # Where it was found, less what the detectors are off by on average.
     axes, mean = valve_axes(sequence(), 1), run.model.accuracy.samples.mean(axis=0)
     np.testing.assert_allclose(
         case.surface.vertices, sequence().vertices[1] - mean[0] @ axes.T, atol=1e-9
@@ -152,129 +116,90 @@ def test_what_is_told_of_the_frames_is_taken(run, tmp_path):
 
 def test_the_pressure_may_come_from_a_curve(run, tmp_path):
     (tmp_path / "curve.csv").write_text("time,pressure\n0,0\n0.1,96\n0.2,120\n")
-    status, _, err = run(
-        "check=true", "imaged.closed_frame=2", "imaged.pressure_curve=curve.csv", pressure=False
-    )
+    curve = "imaged.pressure_curve=curve.csv"
+    status, _, err = run("check=true", "imaged.closed_frame=2", curve, pressure=False)
     assert status == 0, err
     (case,) = (tmp_path / "outputs" / "volume").glob("*/case")
     assert read_case(case).frames[-1].pressure_mmHg == pytest.approx(96.0)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "pressure", "message"),
+    ("arguments", "message"),
     [
-        (("imaged.pressure_curve=curve.csv",), True, "expected one of them"),
-        (("imaged.pressure_mmHg=16",), False, "16.0 mmHg on the closed valve"),
-        (("imaged.closed_frame=9",), True, "closed frame 9, expected one of 0 to 3"),
-        (("imaged.thickness_mm=[1.2]",), True, "one number for each of anterior, posterior"),
-        (("imaged.modality=xray",), True, "imaged.modality = 'xray'"),
-        (("volume=null",), True, "volume is not given"),
-        (("volume=nowhere.nrrd",), True, "nowhere.nrrd: no such file"),
-        (("imaged.model=nowhere.npz", "imaged.modality=ct"), True, "modality"),
+        (("imaged.pressure_curve=curve.csv",), "expected one of them"),
+        (("imaged.closed_frame=9",), "closed frame 9, expected one of 0 to 3"),
+        (("imaged.thickness_mm=[1.2]",), "one number for each of anterior, posterior"),
+        (("volume=null",), "volume is not given"),
+        (("volume=nowhere.nrrd",), "nowhere.nrrd: no such file"),
     ],
 )
-def test_what_is_missing_or_wrong_is_one_line(run, arguments, pressure, message):
-    status, _, err = run("check=true", *arguments, pressure=pressure)
+def test_a_wrong_request_is_one_line(run, arguments, message):
+    status, _, err = run("check=true", *arguments)
     assert status == 2
     assert message in err
     assert "Traceback" not in err
 
 
-def test_a_volume_without_a_valve_and_a_model_without_accuracy_end_in_their_reason(
-    run, monkeypatch
+def test_a_volume_unlike_those_of_training_is_named_and_its_errors_are_wider(
+    run, volume, monkeypatch
 ):
-    finds(monkeypatch, NoValveError("my_tee.seq.nrrd: no valve found"))
-    status, _, err = run("check=true")
-    assert status == 2
-    assert "no valve found" in err
-    run.model.accuracy = None
-    status, _, err = run("check=true")
-    assert status == 2
-    assert "accuracy was never measured" in err
+    personalised = []
 
+    def not_here(values, personal, case, images):
+        personalised.append((case, images))
+        raise InputError("not tried here")
 
-def test_the_case_is_personalised_and_its_record_says_of_the_images(run, volume, asked):
-    status, _, err = run("figures=false", "tracking.enabled=false")
-    assert status == 2
-    assert "not tried here" in err
-    ((case, images),) = asked
-    # By its content: a file may be called after a patient.
-    assert case.name == f"volume {sha256_of(volume)[:12]}"
-    assert [row["file"] for row in images["pictures"]] == ["montage.png", "measures_over_time.png"]
-    (step,) = images["image_step"]
-    assert len(images["image_frames"]) == len(step["confidence"]) == 4
-    assert (step["open_frame"], step["shape"]) == (0, [4, 20, 20, 20])
-    assert json.dumps(images, allow_nan=False)
-
-
-def test_a_volume_unlike_those_of_training_is_said_to_be_and_its_errors_are_wider(run, asked):
-    seen = sequence().confidence
-    measured = run.model.accuracy
+    monkeypatch.setattr("experiments.common.cases.own_case.run_case", not_here)
+    seen, measured = sequence().confidence, run.model.accuracy
     for like_from, widening in ((seen - 0.05, (1.0, 0.0)), (seen + 0.05, (1.0, 7.0))):
         run.model.accuracy = replace(measured, like_from=like_from, widening=widening)
         assert run("figures=false", "tracking.enabled=false")[0] == 2
-    (like, step), (unlike, other) = ((case, images["image_step"][0]) for case, images in asked)
-    assert step["unlike"] == ""
+    (like, images), (unlike, other) = personalised
+    assert like.name == f"volume {sha256_of(volume)[:12]}"
+    assert [row["file"] for row in images["pictures"]] == ["montage.png", "measures_over_time.png"]
+    (step,), (unlike_step,) = images["image_step"], other["image_step"]
+    assert len(images["image_frames"]) == len(step["confidence"]) == 4
+    assert (step["open_frame"], step["shape"], step["unlike"]) == (0, [4, 20, 20, 20], "")
+    assert json.dumps(images, allow_nan=False)
     expected = f"{seen:.2f} in the median frame, expected at least {seen + 0.05:.2f}"
-    assert expected in other["unlike"]
-    assert "4.8 % of volumes" in other["unlike"]  # one in twenty-one
-    assert any("unlike those that the detectors" in said for said in other["sentences"])
+    assert expected in unlike_step["unlike"]
+    assert "4.8 % of volumes" in unlike_step["unlike"]  # one in twenty-one
     spread = [np.std(case.error_samples.vertices, axis=0).mean() for case in (like, unlike)]
     assert spread[1] / spread[0] == pytest.approx(np.exp(7.0 * (1.0 - seen)))
 
 
-def test_what_is_missing_is_said_before_the_volume_is_searched(run):
-    # The search takes a second for every frame.
+def test_an_estimate_needs_a_pressure_and_a_check_does_not(run, tmp_path):
+    # The search of the volume takes a second for every frame.
     status, _, err = run(pressure=False)
-    assert status == 2
+    assert (status, run.told) == (2, [])
     assert "imaged.pressure_mmHg or imaged.pressure_curve" in err
-    assert run.told == []
-
-
-def test_a_check_without_a_pressure_draws_and_says_what_the_estimate_needs(run, tmp_path):
     status, out, err = run("check=true", pressure=False)
     assert status == 0, err
-    (folder,) = (tmp_path / "outputs" / "volume").iterdir()
-    assert (folder / "montage.png").is_file()
-    assert (folder / "images" / "measures.csv").is_file()
-    # A case with a pressure that nobody stated must not lie there to be estimated.
-    assert not (folder / "case").exists()
     assert "an estimate will need imaged.pressure_mmHg" in out
+    (montage,) = (tmp_path / "outputs" / "volume").glob("*/montage.png")
+    # A case with a pressure that nobody stated must not exist.
+    assert not (montage.parent / "case").exists()
 
 
-def test_a_candidate_that_is_not_accepted_is_drawn_as_such(run, monkeypatch, tmp_path):
+def test_no_valve_no_accuracy_or_one_frame_end_in_their_reason(run, monkeypatch, tmp_path):
     titles = []
-
-    def titled(figure, title, note):
-        titles.append(title)
-
-    finds(monkeypatch, NoValveError("no valve found; 0.31, expected at least 0.6", sequence()))
-    monkeypatch.setattr("mvest.reporting.images.headline", titled)
+    monkeypatch.setattr("mvest.reporting.images.headline", lambda *given: titles.append(given[1]))
+    run.found = NoValveError("no valve found; 0.31, expected at least 0.6", sequence())
     status, _, err = run("check=true")
     assert status == 2
     (drawn,) = (tmp_path / "outputs" / "volume").glob("*/candidate.png")
-    assert "0.31, expected at least 0.6" in err
-    assert f"not accepted, is drawn in {drawn}" in err
-    (title,) = titles
-    assert title.startswith("NO VALVE FOUND; best candidate, not accepted: volume ")
-    assert not list((tmp_path / "outputs" / "volume").glob("*/case"))
-
-
-def test_the_confidence_below_which_there_is_no_valve_is_a_setting(run, monkeypatch):
-    told = finds(monkeypatch, sequence())
-    assert run("check=true", "imaged.min_confidence=0.1")[0] == 0
-    assert told == [0.1]
-
-
-def test_one_frame_is_no_cycle(run, volume, tmp_path):
-    # The largest and the smallest orifice would be the same frame.
-    frames = np.random.default_rng(1).integers(0, 255, (1, 20, 20, 20), dtype=np.uint8)
-    single = VolumeSequence(
-        frames, np.full(3, 3.0), np.eye(3), np.full(3, -30.0), np.zeros(1), Modality.ULTRASOUND
+    assert (
+        f"0.31, expected at least 0.6; the best candidate, not accepted, is drawn in {drawn}"
+        in (err)
     )
-    write_sequence_nrrd(tmp_path / "single.seq.nrrd", single)
-    status, _, err = run("check=true", f"volume={tmp_path / 'single.seq.nrrd'}")
+    assert titles[0].startswith("NO VALVE FOUND; best candidate, not accepted: volume ")
+    assert not list((tmp_path / "outputs" / "volume").glob("*/case"))
+    run.model.accuracy = None
+    status, _, err = run("check=true")
     assert status == 2
-    assert "single.seq.nrrd" in err
+    assert "accuracy was never measured" in err
+    # The largest and the smallest orifice would be the same frame.
+    single = written(tmp_path / "single.seq.nrrd", np.zeros(1))
+    status, _, err = run("check=true", f"volume={single}")
+    assert status == 2
     assert "one frame, expected two or more" in err
-    assert run.told == []

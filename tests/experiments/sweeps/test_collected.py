@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from experiments.sweeps.collected import Sweep, head_of, read_sweep, read_sweeps, write_sweep_file
+from experiments.sweeps.collected import Sweep, head_of, read_sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import InputError
-from tests.experiments.studies.made_up import SOURCE, made_up_twin
+from tests.experiments.studies.made_up import SOURCE
 from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, lost, noise, run, sweep
 
 HOSTILE = r"<b>x</b> | 5 % & $y$ \input{z}_1"
@@ -41,14 +41,6 @@ def test_a_sweep_comes_back_from_its_file(tmp_path, whole):
     assert contents(tmp_path)["a.json"] == contents(tmp_path)["b.json"]
 
 
-def test_a_record_is_kept_without_what_no_table_shows():
-    whole = made_up_twin()
-    head = head_of(whole)
-    assert whole.tables
-    assert head.tables == {}
-    assert head.estimates[0].unknowns == whole.estimates[0].unknowns
-
-
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -68,28 +60,6 @@ def test_a_damaged_sweep_is_named(tmp_path, damage, words):
     path.write_text(json.dumps(data))
     with pytest.raises(InputError, match=words):
         read_sweep(path)
-
-
-def test_published_sweeps_are_read_in_their_order(tmp_path):
-    assert read_sweeps(tmp_path) == []
-    (tmp_path / "sweeps").mkdir()
-    for whole in (noise(2), small()):
-        write_sweep_file(tmp_path / "sweeps" / f"{whole.name}.json", whole)
-    assert [whole.name for whole in read_sweeps(tmp_path)] == ["filter", "noise"]
-    (tmp_path / "sweeps" / "a.json").write_text("{", encoding="utf-8")
-    with pytest.raises(InputError, match=r"a\.json is not JSON"):
-        read_sweeps(tmp_path)
-
-
-def test_everything_of_a_sweep_stands_side_by_side(tmp_path):
-    written = write_sweep(tmp_path, small())
-    assert {path.name for path in written} == set(contents(tmp_path)) == {
-        "sweep_filter.csv", "sweep_filter_table.csv", "sweep_filter_table.tex", "sweep_filter.md",
-        "sweep_filter.png",
-    }  # fmt: skip
-    page = (tmp_path / "sweep_filter.md").read_text(encoding="utf-8")
-    assert "(sweep_filter.png)" in page
-    assert "nan" not in page
 
 
 def test_equal_sweeps_give_equal_files_whenever_they_ran(tmp_path):

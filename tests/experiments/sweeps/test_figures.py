@@ -3,13 +3,10 @@
 import pytest
 
 from experiments.sweeps.figures import figures_of
-from mvest.reporting.figures import plain_number
 from tests.experiments.sweeps.made_up_sweeps import (
     TRUTH,
     failed_run,
     job,
-    lost,
-    noise,
     run,
     starts,
     sweep,
@@ -78,19 +75,3 @@ def test_the_matrix_shows_the_worst_parameters_root_mean_square():
     jobs = [job({"a": a, "b": b}, runs) for a in (1, 2) for b in (1, 2)]
     # Root of (1 + 49) / 2 = 5.
     assert {t.get_text() for t in figures_of(sweep("x", jobs))["matrix"].axes[0].texts} == {"5"}
-
-
-def test_nothing_to_draw_gives_no_figure():
-    assert set(figures_of(starts())) == {"", "matrix"}
-    assert set(figures_of(noise(3))) == {"", "matrix"}
-    one_factor = sweep("x", [job({"a": k}, [run(1, TRUTH, [0.1, 0.1])]) for k in (1, 2)])
-    assert set(figures_of(one_factor)) == {""}
-    assert figures_of(sweep("x", [job({"a": 1}, [run(1, TRUTH, [0.1, 0.1])])])) == {}
-    assert figures_of(lost(starts())) == {}
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(0, "0"), (0.0004, "4e-4"), (0.012, "0.012"), (2.25, "2.2"), (73.4, "73")]
-)
-def test_numbers_on_axes_are_short(value: float, text: str):
-    assert plain_number(value) == text

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pandas import read_csv
 
-from experiments.sweeps.report import by_setting, factors_of, runs_of, shortened
+from experiments.sweeps.report import by_setting, runs_of, shortened
 from mvest.estimation.estimate import NOT_THE_POSTERIOR
 from tests.experiments.sweeps.made_up_sweeps import (
     TRUTH,
@@ -51,22 +51,6 @@ def test_errors_by_hand():
     assert (found["forward solves"], found["forward solves, max"]) == (3, 3)
 
 
-def test_what_a_failed_run_left_behind_is_no_estimate():
-    astray = failed_run(2, "too many rounds", estimate=[60.0, 20.0], std=[0.1, 0.1])
-    whole = sweep("x", [job({}, [run(1, TRUTH, [0.1, 0.1]), astray])])
-    found = by_setting(whole).rows[0]
-    assert (found["runs"], found["failed"], found["largest error"]) == (1, 1, 0.0)
-    # The tidy table keeps it.
-    assert runs_of(whole).frame["estimate"].max() == 60.0
-
-
-def test_without_a_bound_or_a_run_there_is_no_ratio():
-    assert group([0.1], bound=None)["RMSE / bound"] is None
-    nothing = group([], failed=3)
-    assert (nothing["runs"], nothing["failed"]) == (0, 3)
-    assert nothing["RMSE"] is nothing["largest error"] is nothing["coverage"] is None
-
-
 def test_coverage_by_hand():
     # Half width 1.9600 standard deviations of 0.1.
     found = group([0.1, -0.1, 0.3, -0.3], failed=1)
@@ -76,13 +60,6 @@ def test_coverage_by_hand():
     assert found["coverage, high"] == pytest.approx(50 + 34.996, abs=1e-3)
     assert group([0.1959])["coverage"] == 100.0
     assert group([0.1961])["coverage"] == 0.0
-
-
-def test_an_interval_that_the_record_states_counts():
-    stated = run(1, TRUTH, [0.1, 0.1])
-    ends = [one.model_copy(update={"low": 7.0, "high": 8.0}) for one in stated.unknowns]
-    whole = sweep("x", [job({"a": 1}, [stated.model_copy(update={"unknowns": tuple(ends)})])])
-    assert by_setting(whole).rows[0]["coverage"] == 0.0
 
 
 def test_every_run_has_its_rows_with_factors_first_and_failures_kept():
@@ -108,11 +85,6 @@ def test_every_run_has_its_rows_with_factors_first_and_failures_kept():
     assert (rows[-1]["noise"], rows[-1]["true value"], rows[-1]["estimate"]) == (1.0, None, None)
 
 
-def test_seeds_of_a_killed_job_are_counted_where_some_left_an_estimate():
-    killed = job({"a": 1}, [run(4, [6.2, 2.0], [0.1, 0.1])], "killed", seed=3, repeats=3)
-    assert [(one.seed, one.converged) for one in killed.runs] == [(4, True), (3, False), (5, False)]
-
-
 def test_the_file_is_plain_and_free_of_times():
     whole = sweep(
         "x", [job({"truth": "finer\nmesh", "start_anterior": 5.0}, [failed_run(1, "a\nb")])]
@@ -124,15 +96,6 @@ def test_the_file_is_plain_and_free_of_times():
     assert list(back.columns)[:2] == ["truth", "start anterior [MPa]"]
     assert set(back["truth"]) == {"finer mesh"}
     assert list(back["true value [MPa]"]) == TRUTH.tolist()
-
-
-def test_names_of_factors_carry_units_and_hide_no_column():
-    factors = {"noise_mm": 1, "start_anterior": 1, "kind": "a", "P0": 1, "std": 2, "seed": 3}
-    found = factors_of(sweep("x", [job(factors, [])]))
-    assert list(found.values()) == [
-        ("noise", "mm"), ("start anterior", "MPa"), ("kind", ""), ("P0", "filter coordinates²"),
-        ("std (factor)", ""), ("seed", ""),
-    ]  # fmt: skip
 
 
 def test_a_row_for_each_setting_below_the_papers():

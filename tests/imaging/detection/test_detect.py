@@ -6,7 +6,6 @@ import pytest
 from mvest.imaging.detection.detect import fit_frame
 from tests.imaging.detection.made_up import (
     NumberedFrame,
-    Oracle,
     oracle_model,
     placed,
     poses,
@@ -44,16 +43,6 @@ def test_the_fit_arrives_at_the_true_valve(shape, true):
     # Vertices are those of pose and coefficients up to the free displacement.
     shown = found.pose.world(shape.shape(found.coefficients[None]))[0]
     assert mean_gap(found.vertices, shown) < 0.3
-
-
-def test_a_given_start_is_begun_with(shape, true):
-    # Trees that read no shape off at a pose have no part in it.
-    b = shape.coefficients(true.pose.local(true.vertices[None]))[0]
-    blind = oracle_model(shape, [true])
-    blind.boosters["shape"] = Oracle(14, lambda x: np.full((len(x), 14), 9.0))
-    for model in (oracle_model(shape, [true]), blind):
-        found = fit_frame(NumberedFrame(), model, true.pose, coefficients=b, tips=true.tips)
-        assert mean_gap(found.vertices, true.vertices) < 0.3
 
 
 def test_the_confidence_is_what_is_seen_of_leaflets_and_part_of_the_pose_rating(shape, true):

@@ -100,7 +100,7 @@ GRIDS = [
 @pytest.mark.parametrize(("spacing", "shape"), GRIDS)
 @pytest.mark.parametrize("direction", [ROTATION, MIRRORED])
 def test_a_bright_ball_is_at_its_place_in_every_level(spacing, shape, direction):
-    # Half a voxel of some level, of the old or the new grid, or transposed axes, are seen here.
+    # Half a voxel of some level, of the old or the new grid, or transposed axes, fail here.
     frame = standard_frame(cube(spacing, direction, shape, 2.5), 0)
     for number in range(3):
         ranks = frame.level(number).ravel().astype(float)

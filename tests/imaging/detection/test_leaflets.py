@@ -34,7 +34,7 @@ def points_of(true):
 
 
 def test_each_landmark_is_found_by_its_own_trees(true):
-    # Trees of a neighbour in the list, votes in world axes, or a scaled vote are seen here.
+    # Trees of a neighbour in the list, votes in world axes, or a scaled vote fail here.
     trees = {
         f"landmark_{k}": made.landmark_oracle([true], made.LAYOUT, k) for k in range(len(LANDMARKS))
     }
@@ -83,7 +83,7 @@ def test_votes_spread_by_their_distance():
 @pytest.mark.parametrize("row", [0, -1])
 @pytest.mark.parametrize("closure", [0.0, 0.5])
 def test_axes_run_along_the_rim_and_away_from_the_leaflet(row, closure):
-    # Towards the leaflet at one of the rims, or against phi, is seen here.
+    # Towards the leaflet at one of the rims, or against phi, fails here.
     x = leaflets(made.LAYOUT, closure)
     grid = x.reshape(made.LAYOUT.rows, made.LAYOUT.columns, 3)
     axes, rim = module.rim_axes(x, made.LAYOUT, row % made.LAYOUT.rows), grid[row]
@@ -113,7 +113,7 @@ def test_the_rim_moves_to_where_votes_say_it_is(true, rim):
 
 @pytest.mark.parametrize("rim", module.RIMS)
 def test_samples_say_where_the_true_rim_is(shape, other, rim):
-    # Learning from candidates of one rim towards the other, or in world axes, is seen here.
+    # Learning from candidates of one rim towards the other, or in world axes, fails here.
     x, y = module.rim_samples(made.labelled(other, shape), rim, 240)
     assert y.shape == (len(x), 2)
     points, rotation, _, _ = made.seen(x)
@@ -137,7 +137,7 @@ def normals(x, layout):
 
 @pytest.mark.parametrize("closure", [0.0, 0.5])
 def test_axes_are_orthonormal_and_normals_those_of_the_triangles(closure):
-    # Normals to the atrium, or along phi the other way round, are seen here.
+    # Normals to the atrium, or along phi the other way round, fail here.
     x = leaflets(FINE, closure)
     axes = module.leaflet_axes(x, FINE)
     orthonormal(axes)
@@ -164,7 +164,7 @@ def test_the_gap_is_along_the_guess_normal_not_the_shortest():
 
 @pytest.mark.parametrize("reach", [6.0, 3.3])
 def test_the_leaflets_are_found_along_their_normals(true, reach):
-    # A sign, a step or a vertex lost between places and offsets is seen here; the prior of the
+    # A sign, a step or a vertex lost between places and offsets fails here; the prior of the
     # distance makes it a little short.
     n = normals(true.vertices, made.LAYOUT)
     by = np.random.default_rng(0).uniform(-0.3 * reach, 0.3 * reach, made.LAYOUT.size)

@@ -16,7 +16,7 @@ def angle(a, b):
 
 
 def test_world_is_scaled_then_turned_then_moved():
-    # Axes in rows instead of columns, or a scale that moves the centre, are seen here.
+    # Axes in rows instead of columns, or a scale that moves the centre, fail here.
     some = poses(5)
     p = np.array([1.0, -2.0, 3.0])
     for k in range(5):
@@ -55,7 +55,7 @@ def test_the_pose_of_a_template_valve_is_along_its_own_axes(closure):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_pose_of_a_valve_follows_a_known_similarity(seed):
-    # A mirrored frame (determinant -1) or a size that is not one is seen here.
+    # A mirrored frame (determinant -1) or a size that is not one fails here.
     x = leaflets(LAYOUT, 0.6)
     before = pose_of(x, TIPS, LAYOUT, 15.0)
     by = poses(1, seed, 50.0)
@@ -86,7 +86,7 @@ def test_a_grid_of_rotations_covers_all_orientations():
 
 # -- guesses that miss a valve by set amounts -----------------------------------------------------
 def test_misses_have_the_requested_deviations(shape):
-    # Degrees taken for radians, or one amount for all, are seen here.
+    # Degrees taken for radians, or one amount for all, fail here.
     true = placed(shape, poses(1, 1), 0.7 * shape.std)
     misses = Misses(2.0, 10.0, 0.05)
     found = labelled(true, shape).missed_poses(misses, 4000)

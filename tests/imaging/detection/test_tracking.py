@@ -58,7 +58,7 @@ def detected(shape, truths, frames=4, *, min_confidence=0.7, progress=None, **of
 
 
 def test_the_valve_is_found_in_every_frame(shape, truths, unsmoothed):
-    # Frames or their confidences in the wrong order are seen here.
+    # Frames or their confidences in the wrong order fail here.
     told = []
     found = detected(shape, truths, progress=lambda done, all_: told.append((done, all_)))
     for k, true in enumerate(truths):
@@ -190,7 +190,7 @@ def test_motion_linear_in_time_is_kept_exactly_at_uneven_times():
 
 
 def test_an_unsure_frame_is_drawn_to_its_neighbours_and_a_sure_one_less():
-    # Weights that do not count, or count the other way round, are seen here.
+    # Weights that do not count, or count the other way round, fail here.
     x = np.zeros((len(UNEVEN), 3, 3))
     x[3] = 5.0
     weight = np.ones((len(UNEVEN), 3))

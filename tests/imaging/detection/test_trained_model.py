@@ -100,7 +100,7 @@ def test_a_wrong_file_is_refused_by_name(path, tmp_path, change, words):
 
 
 def test_all_trees_say_the_same(trained, loaded):
-    # Stages or outputs in another order, or numbers rounded in the text, are seen here.
+    # Stages or outputs in another order, or numbers rounded in the text, fail here.
     rng = np.random.default_rng(0)
     for name in STAGES:
         before, after = trained.boosters[name], loaded.boosters[name]

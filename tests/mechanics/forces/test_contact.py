@@ -7,13 +7,12 @@ import ipctk
 import numpy as np
 import pytest
 
-from mvest.errors import InputError
 from mvest.mechanics.forces.contact import (
     APPROACH,
     BARRIER,
     Contact,
 )
-from mvest.mechanics.forces.pair_search import NEIGHBOUR, ContactPairs, _longest_edges
+from mvest.mechanics.forces.pair_search import NEIGHBOUR, ContactPairs
 from mvest.mechanics.settings import ContactSettings
 from mvest.valve.mesh.solid_mesh import Embedding
 from tests.mechanics.bodies import grid_triangles, point_masses
@@ -75,21 +74,17 @@ def pressure_between_sheets(distance, spacing):
     return -contact_of(y, areas).forces(pairs, y)[0, 2]
 
 
-@pytest.mark.parametrize("distance", [1.15, 1.2, 1.5])
+@pytest.mark.parametrize("distance", [1.15, 1.5])
 def test_points_press_like_parallel_sheets(distance):
     # p(d) = p0 ((h - d) / (h - r0))^4 ((r0 - rb) / (d - rb))^2. The sum over points approaches the
     # integral; a wrong factor (2 pi, 2, or phi for its derivative) shows at once.
     expected = P0 * ((H - distance) / (H - R0)) ** 4 * ((R0 - RB) / (distance - RB)) ** 2
-    spacings = np.array([0.4, 0.2, 0.1, 0.05])
+    spacings = np.array([0.4, 0.2, 0.1])
     errors = [abs(pressure_between_sheets(distance, s) / expected - 1) for s in spacings]
     assert errors[0] < 0.25
-    assert errors[3] < 1e-4
+    assert errors[2] < 1e-3
     # Faster than the third order: the kernel is smooth where it acts.
     assert np.polyfit(np.log(spacings), np.log(errors), 1)[0] > 3
-
-
-def test_no_pressure_beyond_activation():
-    assert pressure_between_sheets(H + 0.01, 0.2) == 0.0
 
 
 # -- smoothness ------------------------------------------------------------------------------------
@@ -101,13 +96,6 @@ def test_force_vanishes_with_the_third_order_at_activation():
     assert np.polyfit(np.log(gaps), np.log(force), 1)[0] == pytest.approx(3, abs=0.05)
     contact, pairs, y = pair(H + 1e-9)
     assert np.all(contact.forces(pairs, y) == 0)
-
-
-def test_the_energy_of_a_pair_grows_without_bound_at_the_barrier():
-    energy = [energy_of(c, p, y) for c, p, y in map(pair, (1.5, RB + 1e-3, RB + 1e-4, RB + 1e-5))]
-    assert np.all(np.diff(energy) > 0)
-    # phi ~ (r - rb)^-2: ten times closer is a hundred times more.
-    assert energy[3] / energy[2] == pytest.approx(100, rel=0.01)
 
 
 # -- forces ----------------------------------------------------------------------------
@@ -146,33 +134,7 @@ def test_action_equals_reaction(cloud):
     np.testing.assert_allclose(np.cross(y, force).sum(axis=0), 0, atol=1e-14)
 
 
-def test_contact_does_not_know_directions(cloud):
-    # Rotating both sheets rotates the forces.
-    contact, pairs, y = cloud
-    q = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    np.testing.assert_allclose(
-        contact.forces(pairs, y @ q.T), contact.forces(pairs, y) @ q.T, atol=1e-15
-    )
-
-
 # -- the stress-free state -------------------------------------------------------------------------
-@pytest.mark.parametrize("spacing", [0.3, 0.7, 1.5])
-def test_a_sheet_at_rest_exerts_no_force(spacing):
-    line = spacing * np.arange(8)
-    rest = np.stack(np.meshgrid(line, line, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
-    contact = contact_of(rest)
-    assert np.all(contact.forces(contact.search(rest), rest) == 0)
-    # ... nor when it is compressed by less than what a pair's reach is short of its rest distance.
-    pressed = (NEIGHBOUR + 0.01) * rest
-    assert np.all(contact.forces(contact.search(pressed), pressed) == 0)
-
-
-def test_sheets_that_are_close_at_rest_exert_no_force():
-    line = np.linspace(0, 3, 7)
-    plane = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
-    rest = np.concatenate([np.column_stack([plane, np.full(49, z)]) for z in (0.0, 1.1)])
-    contact = contact_of(rest)
-    assert np.all(contact.forces(contact.search(rest), rest) == 0)
 
 
 # -- search and passing ----------------------------------------------------------------------------
@@ -270,16 +232,6 @@ def detections(monkeypatch):
     return seen
 
 
-def test_no_collision_is_looked_for_where_points_stay_apart(detections):
-    contact, y, upper = two_sheets(gap=1.6)
-    pairs = contact.search(y)
-    down = np.outer(upper, [0.0, 0.0, -0.4])
-    assert contact.largest_step(pairs, y, down) == 1.0
-    assert not detections
-    assert contact.largest_step(pairs, y, down, detect=True) == 1.0
-    assert len(detections) == 1
-
-
 @pytest.mark.parametrize(
     ("spacing", "gap", "moved", "down"),
     [(1.6, 1.4, 0.0, 0.1), (0.7, 6.0, 0.0, 2.0), (0.7, 1.6, 0.49, 0.4)],
@@ -292,47 +244,6 @@ def test_collisions_are_looked_for_where_nothing_is_proved(detections, spacing, 
     assert not contact.stale(pairs, y)
     contact.largest_step(pairs, y, np.outer(upper, [0.0, 0.0, -down]))
     assert len(detections) == 1
-
-
-def test_nothing_is_proved_of_sheets_that_are_close_at_rest():
-    # Half a millimetre apart as at a commissure: the search leaves such pairs out at any distance.
-    contact, y, upper = two_sheets(gap=0.5)
-    close = contact_of(y, triangles=contact.passing.triangles)
-    pairs = close.search(y)
-    distance = np.linalg.norm(y[pairs.first] - y[pairs.second], axis=1)
-    assert distance.min() > 0.7
-    assert not close.passing.stays_apart(pairs, y, np.outer(upper, [0.0, 0.0, -0.1]))
-    # Neighbours in one sheet are as close, and nothing is asked of them.
-    y = y + np.outer(upper, [0.0, 0.0, 3.0])
-    assert close.passing.stays_apart(close.search(y), y, np.outer(upper, [0.0, 0.0, -0.1]))
-
-
-def test_nothing_is_proved_of_a_meeting_half_way():
-    # One triangle goes by under the other; before and after they are two millimetres apart.
-    corner = np.array([[0.0, 0, 0], [0.7, 0, 0], [0, 0.7, 0]])
-    y = np.concatenate([corner, corner + np.array([2.5, 0, -0.5])])
-    triangles = np.array([[0, 1, 2], [3, 4, 5]])
-    contact = contact_of(
-        y + np.outer(np.repeat([0, 1], 3), [0, 0, FAR]), triangles=triangles, skin=20.0
-    )
-    pairs, aside = contact.search(y), np.outer(np.repeat([0, 1], 3), [-5.0, 0, 0])
-    assert not contact.passing.stays_apart(pairs, y, aside)
-    assert contact.passing.stays_apart(
-        pairs, y - np.outer(np.repeat([0, 1], 3), [0, 0, 0.6]), aside
-    )
-
-
-def test_edges_are_as_long_as_they_get_on_the_way():
-    random = np.random.default_rng(5)
-    y, move = random.normal(size=(2, 12, 3))
-    triangles = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7], [7, 8, 0]])
-    expected = np.zeros(12)
-    for t in np.linspace(0, 1, 11):
-        for triangle in triangles:
-            corners = (y + t * move)[triangle]
-            longest = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).max()
-            expected[triangle] = np.maximum(expected[triangle], longest)
-    np.testing.assert_allclose(_longest_edges(y, move, triangles), expected, rtol=1e-14)
 
 
 def test_sheets_that_touch_are_no_start_of_a_step(capfd):
@@ -388,35 +299,8 @@ def test_what_is_proved_apart_is_free_of_collisions():
     assert proved > 5
 
 
-def crossed(height):
-    line = np.linspace(0, 4, 5)
-    plane = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
-    lower = np.column_stack([plane, np.zeros(25)])
-    upper = np.column_stack([plane + 0.17, np.full(25, 3.0)])
-    triangles = grid_triangles(5)
-    contact = contact_of(
-        np.concatenate([lower, upper]), triangles=np.concatenate([triangles, triangles + 25])
-    )
-    bent = upper.copy()
-    bent[12, 2] = height
-    return contact.intersects(np.concatenate([lower, bent]))
-
-
 def test_crossing_sheets_are_noticed():
-    assert not crossed(0.1)
-    assert crossed(-0.1)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"reference_pressure": 0.0},
-        {"reference_distance": 0.0},
-        {"reference_distance": 2.0, "activation_distance": 2.0},
-        {"activation_distance": 0.5},
-        {"reference_pressure": float("nan")},
-    ],
-)
-def test_inadmissible_settings(settings):
-    with pytest.raises(InputError, match="contact"):
-        ContactSettings(**settings)
+    contact, y, _ = two_sheets(gap=3.0)
+    for height, crosses in ((0.1, False), (-0.1, True)):
+        y[-41, 2] = height  # the middle of the upper sheet
+        assert contact.intersects(y) == crosses

@@ -23,8 +23,6 @@ ANTERIOR, POSTERIOR = (6.23, 2.35, 2.09), (2.09, 1.89, 0.70)
     ("E_f", "ratio", "reading", "bulk"),
     [
         (6.23, 6.23 / 2.35, READING_A, 1.5),
-        (2.09, 2.09 / 1.89, READING_A, 6.1),
-        (6.23, 6.23 / 2.35, READING_C, 17.5),
         (2.09, 2.09 / 1.89, READING_C, 14.4),
     ],
 )
@@ -36,30 +34,12 @@ def test_bulk_modulus_of_both_readings(E_f, ratio, reading, bulk):
     assert np.linalg.eigvalsh(material.stiffness).min() > 0
 
 
-def test_isotropic_bulk_modulus():
-    # K / E = 1 / (3 (1 - 2 nu)) = 13.9 for nu = 0.488.
-    material = TransverselyIsotropic.isotropic(2.0, 0.488)
-    assert 1 / material.compliance[:3, :3].sum() / 2.0 == pytest.approx(1 / (3 * 0.024), rel=1e-9)
-
-
-def test_reading_with_the_ratio_across_is_rejected_for_the_anterior_leaflet():
-    # nu_pf = 0.488 means nu_fp = nu_pf E_f / E_p = 1.294, and
-    # 1 - 0.488 - 2 * 1.294^2 * 2.35 / 6.23 = -0.751 < 0: no stable solid.
-    E_f, E_p, G = ANTERIOR
-    with pytest.raises(MaterialError, match=r"not positive definite.*-0\.75"):
-        TransverselyIsotropic(E_f, E_p, G, nu_fp=0.488 * E_f / E_p, nu_pp=0.488)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"E_f": 0.0}, "E_f = 0.0 MPa, expected > 0"),
-        ({"E_p": -1.0}, "E_p = -1.0 MPa"),
         ({"G": float("nan")}, "G = nan MPa"),
-        ({"E_f": float("inf")}, "E_f = inf MPa"),
         ({"nu_pp": 1.0}, "nu_pp = 1.0, expected -1 < nu_pp < 1"),
-        ({"nu_pp": float("nan")}, "nu_pp = nan"),
-        ({"nu_fp": 1.2}, "not positive definite"),
         ({"nu_fp": float("nan")}, "not positive definite"),
     ],
 )
@@ -67,18 +47,6 @@ def test_inadmissible_moduli_are_rejected_with_their_values(change, message):
     values = {"E_f": 6.23, "E_p": 2.35, "G": 2.09, "nu_fp": 0.488, "nu_pp": 0.488} | change
     with pytest.raises(MaterialError, match=message):
         TransverselyIsotropic(**values)
-
-
-@pytest.mark.parametrize(("ratio", "nu"), [(0.0, 0.4), (-2.0, 0.4), (float("nan"), 0.4)])
-def test_inadmissible_ratio(ratio, nu):
-    with pytest.raises(MaterialError, match="ratio"):
-        TransverselyIsotropic.from_ratio(6.0, ratio, nu, READING_A)
-
-
-@pytest.mark.parametrize("nu", [0.5, 0.7, -1.0, float("nan")])
-def test_inadmissible_isotropic_ratio(nu):
-    with pytest.raises(MaterialError, match="nu ="):
-        TransverselyIsotropic.isotropic(1.0, nu)
 
 
 # -- the moduli come back --------------------------------------------------------------------------
@@ -122,12 +90,8 @@ def principal(f):
     return vectors @ np.diag(np.sqrt(values)) @ vectors.T - np.eye(3)
 
 
-FRAMES = {"aligned": 0.0, "turned": 0.7}
-
-
 @pytest.mark.parametrize("element_type", ELEMENT_NAMES)
-@pytest.mark.parametrize("angle", FRAMES.values(), ids=FRAMES.keys())
-@pytest.mark.parametrize("reading", ["A", "C"])
+@pytest.mark.parametrize(("angle", "reading"), [(0.0, "C"), (0.7, "A")])
 def test_tension_along_the_fibre_recovers_E_f_and_nu_fp(element_type, angle, reading):
     # Uniaxial tension: F = U is diagonal in the fibre frame, P = T (Biot), so that
     # T_11 = E_f (lambda - 1) exactly and the other strains are -nu_fp (lambda - 1), at any stretch.
@@ -142,7 +106,7 @@ def test_tension_along_the_fibre_recovers_E_f_and_nu_fp(element_type, angle, rea
     assert -strain[2, 2] / strain[0, 0] == pytest.approx(0.488, rel=1e-6)
 
 
-@pytest.mark.parametrize("element_type", ELEMENT_NAMES)
+@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
 @pytest.mark.parametrize("reading", ["A", "C"])
 def test_tension_across_the_fibre_recovers_E_p(element_type, reading):
     # T_22 = E_p (lambda - 1); contraction nu_pp across and nu_fp E_p / E_f along the fibre.
@@ -153,20 +117,6 @@ def test_tension_across_the_fibre_recovers_E_p(element_type, reading):
     assert 0.3 / strain[1, 1] == pytest.approx(material.E_p, rel=1e-6)
     assert -strain[2, 2] / strain[1, 1] == pytest.approx(material.nu_pp, rel=1e-6)
     assert -strain[0, 0] / strain[1, 1] == pytest.approx(0.488 / 2.651, rel=1e-6)
-
-
-@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
-@pytest.mark.parametrize("reading", ["A", "C"])
-def test_uniform_pressure_recovers_nu_pp(element_type, reading):
-    # T = -p I: e_22 = -p [(1 - nu_pp) / E_p - nu_fp / E_f], solved for nu_pp.
-    material, p = MATERIALS[reading], 0.05
-    across = (1 - material.nu_pp) / material.E_p - 0.488 / 6.23
-    expected = -p * np.diag([(1 - 2 * 0.488) / 6.23, across, across])
-    mesh = block(element_type, (2, 2, 1))
-    strain = principal(stretched(mesh, material, -p * np.eye(3), expected))
-    nu_pp = 1 - material.E_p * (material.nu_fp / material.E_f - strain[1, 1] / p)
-    assert nu_pp == pytest.approx(material.nu_pp, rel=1e-6)
-    assert strain[0, 0] == pytest.approx(-p * (1 - 2 * 0.488) / 6.23, rel=1e-6)
 
 
 def mean_stress(mesh, material, f):
@@ -233,24 +183,3 @@ def test_biot_strain_is_the_square_root_of_the_deformation():
         [e[0, 0], e[1, 1], e[2, 2], 2 * e[1, 2], 2 * e[0, 2], 2 * e[0, 1]],
         atol=1e-14,
     )
-
-
-def test_the_term_of_the_non_commuting_stretch_is_there():
-    # The usual corotational force drops the part of S that comes from U and C : e not commuting.
-    # For a shear of the aligned anisotropic law that part is not small; for the isotropic law it is
-    # zero.
-    green = np.array([0.1, -0.05, 0.0, 0.0, 0.0, 0.2])
-    for name, present in (("A", True), ("isotropic", False)):
-        law = BiotLaw.of((MATERIALS[name],))
-        s, _ = law.response(
-            Points(green[None, None], np.zeros(1, dtype=int), np.zeros((1, 1, 6)), 0.0)
-        )
-        s = s[0, 0]
-        e = law.strain(green[None, None])[0, 0]
-        u = np.eye(3) + 0.5 * np.array(
-            [[2 * e[0], e[5], e[4]], [e[5], 2 * e[1], e[3]], [e[4], e[3], 2 * e[2]]]
-        )
-        tensor = np.array([[s[0], s[5], s[4]], [s[5], s[1], s[3]], [s[4], s[3], s[2]]])
-        skew = u @ tensor - tensor @ u
-        assert bool(np.abs(skew).max() > 5e-4) is present
-        assert present or np.abs(skew).max() < 1e-14

@@ -6,7 +6,7 @@ import pytest
 from mvest.errors import InputError
 from mvest.mechanics.law import Points
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import ExponentialLaw, biaxial_stress
+from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.regional import LeafletLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue, TissueSettings
@@ -64,25 +64,6 @@ def test_cauchy_stress_is_that_of_the_whole_deformation(base):
     np.testing.assert_allclose(cauchy(F, S), expected, atol=1e-12 * np.abs(expected).max())
 
 
-def test_a_sheet_pulls_as_the_smaller_one_that_it_was_made_of():
-    seen = np.array([[1.02, 1.05], [1.0, 0.99]])
-    law = prestretched(prestretch=[1.06, 1.06], region=np.zeros(2, dtype=np.int64))
-    whole = biaxial_stress(LINEAR, 1.06 * seen)
-    # Of nominal stress: its section is narrower by the prestretch, and thicker by its square.
-    np.testing.assert_allclose(biaxial_stress(law, seen), 1.06 * whole, rtol=1e-9)
-
-
-def test_without_prestretch_it_is_the_law_itself():
-    law = prestretched(prestretch=[1.0, 1.0])
-    previous = LINEAR.strain(0.5 * GREEN)
-    for one, other in zip(
-        law.response(Points(GREEN, REGION, previous, 0.7)),
-        LINEAR.response(Points(GREEN, REGION, previous, 0.7)),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_at_rest_it_pulls_and_damping_does_not():
     law = prestretched()
     rest = law.strain(NONE)
@@ -134,26 +115,3 @@ def test_derivative_by_a_prestretch_agrees_with_differences(base, which):
     assert not found[which != REGION].any()
     with pytest.raises(InputError, match="at an equilibrium only"):
         law.partial_stress(name, Points(GREEN, REGION, NONE, 0.7), **given)
-
-
-def test_derivative_by_a_modulus_agrees_with_differences():
-    def stress(E):
-        base = BiotLaw.of([TISSUE.material(E), TISSUE.material(2.0)])
-        return prestretched(base).response(Points(GREEN, REGION, NONE, 0.0))[0]
-
-    by = (stress(5.0 + 1e-6) - stress(5.0 - 1e-6)) / 2e-6
-    found = prestretched().partial_stress(
-        Parameter("E_f.anterior", 5.0),
-        Points(GREEN, REGION, NONE, 0.0),
-        which=0,
-        stress=stress(5.0),
-    )
-    np.testing.assert_allclose(found, by, atol=1e-7 * np.abs(by).max())
-
-
-def test_settings_refuse_what_is_no_prestretch():
-    with pytest.raises(InputError, match="tissue prestretch = 0"):
-        TissueSettings(2.6, prestretch=0.0)
-    with pytest.raises(InputError, match="the corotational law has none"):
-        TissueSettings(2.6, law="corotational", prestretch=1.1)
-    assert "prestretch" not in TissueSettings(2.6, law="corotational").kinds

@@ -233,7 +233,6 @@ def test_the_scene_has_the_gap_in_its_place(fields):
 
     touching = parts(200.0)
     assert [part.name for part in touching["closed, personalised"]] == ["touching"]
-    assert len(touching["distance, generic"]) == 1
     assert not touching["open"]
     assert not parts(None)["closed, personalised"]
     (gap,) = parts(0.0)["closed, personalised"]

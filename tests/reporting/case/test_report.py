@@ -116,7 +116,7 @@ def test_the_scene_shows_one_state_at_a_time(html) -> None:
     shown = re.findall(r'data-shown="([^"]*)">([^<]*)<', html)
     assert [label for _, label in shown] == [
         "open", "closed, observed", "closed, generic", "closed, personalised",
-        "distance, generic", "distance, personalised", "observed (grey) over personalised",
+        "observed (grey) over personalised",
     ]  # fmt: skip
     visible = np.array([[word == "true" for word in re.findall(r"\w+", v)] for v, _ in shown])
     # Every trace belongs to exactly one state.

@@ -100,16 +100,6 @@ def test_fibres_are_those_of_the_leaflet_they_are_asked_of(valve, band):
     np.testing.assert_allclose(np.linalg.norm(fibres, axis=1), 1)
 
 
-def test_a_sampled_valve_is_the_same_valve(valve, band):
-    fine = band.sampled(96, 25)
-    assert fine.surface.areas.sum() == pytest.approx(valve.surface.areas.sum(), rel=0.01)
-    # Its annulus moves as that of the valve: towards the closed annulus of the template.
-    end = TEMPLATE.valve(720, 3).motion.annulus[-1]
-    gap = np.linalg.norm(fine.motion.annulus[-1][:, None] - end[None], axis=2).min(axis=1)
-    assert gap.max() < 0.15
-    np.testing.assert_allclose(fine.motion.annulus[0], fine.surface.vertices[:96], atol=1e-12)
-
-
 def test_a_valve_of_three_leaflets_is_refused(valve):
     surface = valve.surface
     region = surface.region.copy()

@@ -107,12 +107,6 @@ def test_labels_decide_where_they_are_known(valve: Valve, solid: ClosedSurface) 
     assert swapped.derived == ()
 
 
-def test_triangles_that_face_inwards_are_turned(solid: ClosedSurface, middle: Midsurface) -> None:
-    vertices, triangles = closed_band(solid.vertices, solid.triangles[:, ::-1])
-    np.testing.assert_array_equal(triangles, solid.triangles)
-    assert len(vertices) == len(solid.vertices)
-
-
 def test_what_is_no_thick_band_is_refused(solid: ClosedSurface) -> None:
     two = np.concatenate([solid.triangles, solid.triangles + len(solid.vertices)])
     apart = np.concatenate([solid.vertices, solid.vertices + 100.0])

@@ -156,19 +156,6 @@ def test_elements_belong_to_the_leaflet_they_lie_in(name):
     np.testing.assert_array_equal(surface.region[nearest][far], mesh.region[far])
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_fibres_are_unit_vectors_and_jump_between_the_leaflets(name):
-    mesh = structured_mesh(TEMPLATE, name, 36, 4)
-    np.testing.assert_allclose(np.linalg.norm(mesh.fibre, axis=2), 1, atol=1e-12)
-    commissure = TEMPLATE.position(np.zeros(1), np.zeros(1), -1.0)[0]
-    node = int(np.argmin(np.linalg.norm(mesh.nodes - commissure, axis=1)))
-    assert np.linalg.norm(mesh.nodes[node] - commissure) < 1e-9
-    e, a = np.nonzero(mesh.elements == node)
-    one, other = (mesh.fibre[e, a][mesh.region[e] == k] for k in (0, 1))
-    # Perpendicular to the annulus in the anterior leaflet, parallel to it in the posterior.
-    np.testing.assert_allclose(one @ other.T, 0, atol=1e-9)
-
-
 def test_the_hash_is_that_of_the_content():
     base = structured_mesh(TEMPLATE, "hex18", 12, 2).sha256
     assert structured_mesh(Template(), "hex18", 12, 2).sha256 == base

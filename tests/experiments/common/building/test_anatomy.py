@@ -10,18 +10,12 @@ from scipy.spatial.transform import Rotation
 from experiments.common.building.closure import (
     anatomy_of,
     build_mesh,
-    closure_model,
-    template_of,
-    upright,
 )
 from experiments.common.building.gate import anatomy_digest
-from experiments.common.building.twin import build_twin
 from experiments.common.config import hash_of, plain
 from mvest.cases.folder import read_case, write_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.scenarios.scenario import plane_of
-from mvest.valve.anatomy.template import Template
-from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.measure.annulus import measure_annulus
 from tests.cases.folders import template_case
 from tests.experiments.configured import composed
@@ -51,22 +45,6 @@ def case():
 @pytest.fixture(scope="module")
 def folder(case, tmp_path_factory):
     return write_case(tmp_path_factory.mktemp("anatomy") / "case", case)
-
-
-def test_the_valve_of_a_folder_is_the_one_that_was_written(folder):
-    """The template, written and read as a case, is on the template's surface wherever sampled."""
-    valve, template = (
-        anatomy_of(values_of(folder)).valve(40, 10),
-        upright(Template().valve(112, 29)),
-    )
-    dense = template.surface
-    gap = closest_points(valve.surface.vertices, dense.vertices, dense.triangles).distance
-    assert gap.max() < 0.1  # its flat triangles are 2 mm wide
-    assert abs(valve.surface.areas.sum() / dense.areas.sum() - 1) < 0.02
-    np.testing.assert_allclose(
-        valve.chordae.rest_length, template.chordae.rest_length, atol=0, rtol=1e-12
-    )
-    np.testing.assert_array_equal(valve.motion.annulus[0], valve.motion.annulus[1])
 
 
 def test_axes_are_those_of_the_annulus_wherever_a_case_was_seen(case, folder, tmp_path):
@@ -119,23 +97,6 @@ def test_the_annulus_narrows_as_stated_and_as_a_closed_frame_shows(folder, tmp_p
         anatomy_of(values_of(both, "valve.annulus_contraction=0.1"))
 
 
-def test_it_is_closed_guided_and_estimated_as_the_template_is(folder):
-    values = values_of(folder, *SMALL, experiment="twin")
-    model = closure_model(values)
-    assert (len(model.valve.surface.vertices), model.mesh.element_type) == (400, "hex18")
-    assert build_twin(values_of(folder, *SMALL[2:], experiment="twin")).model.guide is not None
-    other = build_twin({**values, "truth": {**values["truth"], "element": "tet10"}})
-    assert other.truth_model.mesh.element_type == "tet10"
-    finer = closure_model(values, next(c for c in _cases() if c.mesh > 1))
-    assert len(finer.mesh.elements) > len(model.mesh.elements)
-
-
-def _cases():
-    from mvest.closure.robustness import GATE_CASES
-
-    return GATE_CASES
-
-
 def test_an_unstructured_mesh_is_made_of_the_surface_that_was_given(folder, tmp_path):
     mesh = {"source": "tetwild", "edge_length": 5.0}
     solid = build_mesh(anatomy_of(values_of(folder)), mesh, "tet10", tmp_path)
@@ -173,8 +134,3 @@ def test_what_is_wrong_is_one_line(folder, overrides, error, message):
     with pytest.raises(error, match=message) as raised:
         anatomy_of(values)
     assert "\n" not in str(raised.value)
-
-
-def test_studies_that_vary_the_template_refuse_a_folder(folder):
-    with pytest.raises(ConfigurationError, match="varies the template's parameters"):
-        template_of(values_of(folder, experiment="design"))

@@ -5,7 +5,6 @@ import pytest
 
 import mvest.cache
 from experiments.common.building.twin import MADE_BY
-from mvest.cases.folder import write_case
 from mvest.estimation import Prediction
 from mvest.problem.stored import StoredModel, key_of
 
@@ -49,27 +48,7 @@ def test_another_key_or_other_parameters_are_another_truth(tmp_path, change):
     assert model.calls == 2
 
 
-def test_a_failure_is_not_stored(tmp_path):
-    failing = Model("it buckled")
-    assert StoredModel(failing, tmp_path, "key")(AT).reason == "it buckled"
-    assert not list(tmp_path.glob("*.npz"))
-    assert StoredModel(Model(), tmp_path, "key")(AT).converged
-
-
 VALUES = {"mesh": {"columns": 72, "rows": 8}, "element": "hex27", "dt_factor": 0.25}
-
-
-def test_the_key_covers_every_value():
-    base = key_of(VALUES, MADE_BY)
-    assert key_of(dict(reversed(VALUES.items())), MADE_BY) == base
-    others = [
-        {**VALUES, "element": "hex18"},
-        {**VALUES, "dt_factor": 0.5},
-        {**VALUES, "mesh": {"columns": 72, "rows": 9}},
-        {**VALUES, "more": None},
-    ]
-    assert len({base, *(key_of(values, MADE_BY) for values in others)}) == 5
-    assert key_of(VALUES, (write_case,)) != base
 
 
 def test_a_truth_is_made_anew_after_a_change_of_the_code(tmp_path, monkeypatch):

@@ -1,8 +1,8 @@
-"""What runs are compared by: the numbers of a record, and the settings that differ."""
+"""Numbers and settings by which runs are compared, in MLflow and by optimising sweepers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from statistics import fmean, stdev
 from typing import Any
 
@@ -12,21 +12,21 @@ from experiments.sweeps.collected import short_names
 
 Values = Mapping[str, Any]
 
-HANDFUL = (
+ALWAYS = (
     "study", "valve.folder_sha256", "mesh.source", "mechanics.element", "filter.mode",
     "truth.label", "observation.noise_mm", "seed",
 )  # fmt: skip
-"""Settings that every run shows, typed or not."""
+"""Settings that every run shows, overridden or not."""
 
 LARGEST_ERROR = 1.0
-"""Relative error of a modulus beyond which an estimate is no answer."""
+"""Relative error of a modulus beyond which an estimate is implausible."""
 
 
 def metrics(record: Record) -> dict[str, float]:
     """Name -> number, the mean error (%) first.
 
-    Of a job that repeats over seeds these are means over the estimates that converged, and
-    ``spread`` is their standard deviation.
+    For a job that repeats over seeds these are means over the converged estimates, and ``spread``
+    is their standard deviation.
     """
     runs = record.estimates
     short = dict(zip(record.parameters, short_names(record.parameters), strict=True))
@@ -56,10 +56,10 @@ def metrics(record: Record) -> dict[str, float]:
 
 
 def implausible(record: Record) -> str:
-    """Why a run is left out of comparisons; empty if it is not.
+    """Why a run is left out of comparisons; empty if it is plausible.
 
-    It failed, its verdict is that there is no estimate, or a modulus is wrong by more than its
-    truth, where that is known.
+    It failed, its verdict is that there is no estimate, or the relative error of a modulus exceeds
+    `LARGEST_ERROR`.
     """
     if not record.converged:
         return "failed"
@@ -72,21 +72,23 @@ def implausible(record: Record) -> str:
     return ""
 
 
-def settings_of(config: Values, overrides: Iterable[str]) -> dict[str, Any]:
-    """The settings of a run that were typed, as they were typed, and the handful.
+def settings_of(config: Values, overrides: Iterable[str], factors: Values) -> dict[str, Any]:
+    """Overridden settings of a run as they were typed, those of `ALWAYS`, and its factors.
 
     Parameters
     ----------
     config : mapping
-        As it lies beside the result: the content of a file instead of its name, which must not
-        reach a store.
+        As written next to the result, with the content of files in place of their names, which
+        must not reach a store.
     overrides : iterable of str
         ``NAME=VALUE``.
+    factors : mapping
+        Those of a sweep's job; left out if a setting has the same value.
     """
     words = (word.lstrip("+~").partition("=") for word in overrides)
     typed = {name.replace("/", "."): text for name, _, text in words if name != "name"}
     found: dict[str, Any] = {}
-    for name in (*typed, *HANDFUL):
+    for name in (*typed, *ALWAYS):
         value: Any = config
         for part in name.split("."):
             value = value.get(part) if isinstance(value, Mapping) else None
@@ -94,28 +96,5 @@ def settings_of(config: Values, overrides: Iterable[str]) -> dict[str, Any]:
             value = typed[name]
         if value not in (None, "") and is_hashed(name, config["study"]):
             found[name] = value
-    return found
-
-
-def varied(rows: Sequence[Values], factors: Sequence[Values]) -> list[dict[str, Any]]:
-    """Of the columns of jobs those that differ, and the handful; factors that no column repeats."""
-    shown: dict[str, list[Any]] = {}
-    for source in (rows, factors):
-        for name in dict.fromkeys(name for row in source for name in row):
-            values = [row.get(name) for row in source]
-            differs = name in HANDFUL or len(rows) == 1 or len(set(map(repr, values))) > 1
-            if differs and (source is rows or values not in shown.values()):
-                shown[name] = values
-    return [{name: values[k] for name, values in shown.items()} for k in range(len(rows))]
-
-
-def together(rows: Sequence[Values]) -> dict[str, str]:
-    """The values that settings have in a sweep: ``[5,3],[4,2]``."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    each = {name: [text_of(row[name]) for row in rows if name in row] for name in names}
-    return {name: ",".join(dict.fromkeys(texts)) for name, texts in each.items()}
-
-
-def text_of(value: Any) -> str:
-    """A value as it is typed."""
-    return f"{value:.12g}" if isinstance(value, float) else str(value)
+    known = list(found.values())
+    return found | {name: value for name, value in factors.items() if value not in known}
