@@ -18,21 +18,21 @@ MARKUPS = tuple(markup_variants())
 PAGE = ROOT / "docs" / "formats.md"
 HEAD = """# Formats
 
-The tests write each of these files with the libraries that other programs use (VTK, trimesh, meshio,
-SimpleITK, nibabel, pynrrd, pydicom, slicerio), read it, and compare the content. A dot separates
-options that are combined.
+The tests write each of these files with the libraries that other programs use (VTK, trimesh,
+meshio, SimpleITK, nibabel, pynrrd, pydicom, slicerio), read it, and compare the content. A dot
+separates options that are combined.
 
-Importers recognise leaflets by words in names, upper or lower case: `anterior`, `AML`, `AMVL` or `A1` to
-`A3`, and `posterior`, `PML`, `PMVL` or `P1` to `P3`; in `case.yaml` write `anterior` and `posterior`.
+Importers recognise leaflets by words in names, upper or lower case: `anterior`, `AML`, `AMVL` or
+`A1` to `A3`, and `posterior`, `PML`, `PMVL` or `P1` to `P3`; in `case.yaml` write `anterior` and
+`posterior`.
 
 | format | variants | files |
 |---|---|---|
 """
 FOOT = """
 [SlicerHeart folders](slicer.md) and [FEBio](febio.md) have pages of their own. If a file does not
-state something (units, times, which leaflet is which), an error of one line asks for it. Files are
-read by a child process with limited memory and time. This page is written by `python -m
-tests.exchange.variants`.
+state something (units, times, which leaflet is which), an error of one line asks for it. This page
+is written by `python -m tests.exchange.variants`.
 """
 
 
