@@ -167,10 +167,10 @@ IMPORT_NAME = {
     "simpleitk": ("SimpleITK",),
     "vtk": ("vtkmodules",),
 }
-OPTIONAL = ("viz", "cluster", "postgres", "second-model")
+OPTIONAL = ("files", "viz", "cluster", "postgres", "second-model")
 """Extras that mvest and experiments may use, within functions."""
 
-LOCKED = ("dev", "docs", "viz", "cluster")
+LOCKED = ("files", "dev", "docs", "viz", "cluster")
 """Extras that `make lock` pins."""
 
 

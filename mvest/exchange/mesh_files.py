@@ -113,8 +113,14 @@ def _triangles(
 
 
 def vtk_module(name: str) -> Any:
-    """One of VTK's modules. Importing all of them takes a second."""
-    return importlib.import_module(f"vtkmodules.{name}")
+    """One of VTK's modules, because importing all of them takes a second.
+
+    Raises a `ConfigurationError` if VTK is not installed.
+    """
+    try:
+        return importlib.import_module(f"vtkmodules.{name}")
+    except ImportError as error:
+        raise ConfigurationError(f"{error}; pip install 'mvest[files]' has it") from error
 
 
 def _numpy(array: Any) -> NDArray[Any]:

@@ -61,7 +61,7 @@ def test_one_child_serves_all_and_what_it_prints_is_lost():
     [
         ("Geometry", GeometryError, "torn apart"),
         ("Value", InputError, "damaged: odd"),
-        ("Import", ConfigurationError, "needs a library: No module named 'x'"),
+        ("Import", ConfigurationError, "No module named 'x'; pip install 'mvest[files]' has it"),
     ],
 )
 def test_errors_cross_with_their_kind_and_the_name_of_the_file(kind, error, message):
