@@ -132,7 +132,8 @@ class Deck:
         InputError
             There is no such set.
         """
-        members: IntArray = self._known(self.sets[kind], name, f"{kind} set")
+        what = {"NSET": "node set", "ELSET": "element set"}[kind]
+        members: IntArray = self._known(self.sets[kind], name, what)
         return members
 
     def share(self, amplitude: str, times: FloatArray) -> FloatArray:

@@ -60,7 +60,9 @@ class Differences:
 
     def __post_init__(self) -> None:
         if self.scheme not in ("central", "forward"):
-            raise ConfigurationError(f"differences {self.scheme!r}, expected central or forward")
+            raise ConfigurationError(
+                f"differences {self.scheme!r}, expected one of central, forward"
+            )
         if not (0 < self.relative_step < 1 and self.floor >= 0 and self.processes >= 1):
             raise ConfigurationError(
                 f"{self}, expected 0 < relative_step < 1 and no negative floor"

@@ -21,7 +21,7 @@ import numpy as np
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.written import REGIONS
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
-from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_mesh
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, Surface, read_mesh
 from mvest.reading.text import numbers, one_line, read_columns
 from mvest.typing import FloatArray, IntArray
 
@@ -162,7 +162,7 @@ def read_folder(
         )
     phases = [phase for phase in PHASES if any(f.phase == phase for f in chosen)]
     seen = {
-        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], lists)
+        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], models, lists)
         for phase in phases or [""]
     }
     if phases and not all(f.phase for f in chosen):
@@ -172,7 +172,9 @@ def read_folder(
     return seen
 
 
-def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> SeenPhase:
+def _read_phase(
+    folder: Path, mine: Sequence[_File], models: Sequence[_File], lists: Sequence[_File]
+) -> SeenPhase:
     """The phase of some surfaces of leaflets."""
     notes: list[str] = []
     this = min(mine, key=lambda f: int(f.frame or -1))
@@ -185,6 +187,9 @@ def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> 
     names, points = _table("ValveLandmarkPoints.csv", places, this)
     landmarks = dict(zip((*labels, *names), (*contour, *points), strict=True))
     curves = [contour]
+    if len(contour) < MIN_CONTOUR:
+        fitting = [f for f in models if f.phase == this.phase and f.fits(this) and not f.leaflet]
+        curves += [_middle_of_tube(f, notes) for f in fitting if f.words & ANNULUS]
     tips: dict[int, FloatArray] = {}
     # Lists that name this phase come last and override those that name none.
     for file in sorted((f for f in lists if f.fits(this)), key=lambda f: bool(f.phase)):
@@ -233,12 +238,18 @@ def _leaflet(
             f"{folder}: {len(fitting)} surfaces of the {name} leaflet ({listed}), expected one; "
             "only=WORD takes those with a word in their names"
         )
-    surface = read_mesh(fitting[0].path)
+    surface = _model(fitting[0], notes)
     if not len(surface.triangles):
         raise GeometryError(f"{fitting[0].path}: no triangles; expected a surface")
-    if surface.space is None:
+    return surface.vertices, surface.triangles
+
+
+def _model(file: _File, notes: list[str]) -> Surface:
+    """A model with its points in LPS."""
+    model = read_mesh(file.path)
+    if model.space is None:
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
-    return surface.vertices * TO_LPS[surface.space or "RAS"], surface.triangles
+    return replace(model, vertices=model.vertices * TO_LPS[model.space or "RAS"])
 
 
 def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:
@@ -281,3 +292,17 @@ def _tips_in(file: Path, words: set[str], item: PointList) -> dict[int, FloatArr
             "insertion"
         )
     return {muscle: item.points[tip[0] if tip else 1]}
+
+
+def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:
+    """The centre line of a tube whose points are rings, one after another."""
+    points = _model(file, notes).vertices
+    for sides in range(3, 101):
+        if len(points) % sides or len(points) // sides < 8:
+            continue
+        rings = points.reshape(-1, sides, 3)
+        middle = rings.mean(axis=1)
+        radius = np.linalg.norm(rings - middle[:, None], axis=2)
+        if np.ptp(radius) < 0.05 * radius.mean():
+            return middle
+    raise GeometryError(f"{file.path}: {len(points)} points, expected the tube of the annulus")

@@ -170,7 +170,7 @@ def test_parameters_without_a_size_need_a_floor(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"scheme": "exact"}, "central or forward"),
+        ({"scheme": "exact"}, "central, forward"),
         ({"relative_step": 0.0}, "relative_step"),
     ],
 )

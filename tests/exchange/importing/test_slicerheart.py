@@ -111,8 +111,16 @@ def test_one_phase_is_an_anatomy(folder):
     assert [frame.role for frame in alone.frames] == [Role.REFERENCE]
 
 
-def test_the_annulus_alone_gives_the_commissures(folder, case):
+@pytest.mark.parametrize("as_model", [False, True])
+def test_the_annulus_alone_gives_the_commissures(folder, case, as_model):
     (folder / "ValveLandmarkPoints.csv").unlink()
+    if as_model:
+        (folder / "AnnulusContourPoints.csv").unlink()
+        for role, stem in ((Role.REFERENCE, "frame_3_MD"), (Role.CLOSED, "frame_12_MS")):
+            ring = in_lps(TRUTH.frame(role).annulus) * [-1, -1, 1]  # without SPACE: R, A, S
+            line = pyvista.MultipleLines(np.vstack([ring, ring[:1]]))
+            tube = line.tube(radius=0.5, n_sides=20, capping=False).triangulate()
+            tube.save(folder / f"simulated_mitral_{stem}_annulus.vtk")
     found = import_slicerheart(folder, OPTIONS)
     assert any("commissures where the leaflet nearer" in line for line in found.derived)
     for frame, expected in zip(found.frames, case.frames, strict=True):

@@ -29,8 +29,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("together", [False, True])
-def test_one_surface_for_each_leaflet(tmp_path: Path, together: bool) -> None:
+def test_one_surface_for_each_leaflet(tmp_path: Path) -> None:
     parts = {}
     for number, name in enumerate(("a", "p")):
         used, inverse = np.unique(VALVE.triangles[VALVE.region == number], return_inverse=True)
@@ -45,14 +44,9 @@ def test_one_surface_for_each_leaflet(tmp_path: Path, together: bool) -> None:
             thickness=VALVE.thickness[used],
         )
         solid = thicken(part)
-        meshio.Mesh(solid.vertices, [("triangle", solid.triangles)]).write(tmp_path / f"{name}.stl")
         parts[name] = solid.vertices, solid.triangles
-    if together:
-        path = write_parts(tmp_path / "valve.glb", parts)
-        given = replace(OPTIONS, anterior="a", posterior="p")
-    else:
-        path, given = tmp_path / "a.stl", replace(OPTIONS, posterior=str(tmp_path / "p.stl"))
-    found = import_leaflets(path, given).surface
+    path = write_parts(tmp_path / "valve.glb", parts)
+    found = import_leaflets(path, replace(OPTIONS, anterior="a", posterior="p")).surface
     nearest = closest_points(found.vertices, VALVE.vertices, VALVE.triangles)
     assert np.sqrt(np.mean(nearest.distance**2)) < 0.15
     centres = found.vertices[found.triangles].mean(axis=1)
