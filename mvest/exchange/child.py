@@ -197,7 +197,8 @@ def _answered(call: dict[str, Any]) -> dict[str, Any]:
     except MvestError as error:
         return {"error": type(error).__name__, "message": str(error)}
     except ImportError as error:
-        return {"error": "ConfigurationError", "message": f"{error}; pip install 'mvest[files]' has it"}
+        reason = f"{error}; pip install 'mvest[files]' has it"
+        return {"error": "ConfigurationError", "message": reason}
     except MemoryError:
         reason = f"reading it needs more than {call['memory_gb']:g} GiB"
         return {"error": "InputError", "message": reason}
