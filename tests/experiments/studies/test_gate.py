@@ -16,7 +16,6 @@ from experiments.studies.gate import STUDY
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GATE_CASES, MAX_LIMIT, MEAN_LIMIT, GateCase
 from mvest.closure.smoothness import JUMP_LIMIT
-from mvest.estimation import Prediction
 from mvest.reporting.tables import table
 from tests.experiments.configured import composed, plain
 from tests.places import ANATOMIES
@@ -169,17 +168,6 @@ def test_the_gate_study_records_every_case(run):
     assert {"gate.csv", "gate.md"} <= {path.name for path in folder.iterdir()}
     for case in GATE_CASES:
         assert f"{case.name}: max" in said.err
-
-
-def test_a_reference_that_does_not_close_is_recorded_as_a_failure(run, monkeypatch):
-    monkeypatch.setattr(ClosureModel, "__call__", lambda self, m: Prediction.failed("it buckled"))
-    status, record, _, said = run("experiment=gate", *ONE)
-    assert status == 1
-    assert (record.status, record.reason) == ("failed", "it buckled")
-    assert record.numbers["passed"] is False
-    (reference,) = record.table_of("variations").rows
-    assert (reference["variation"], reference["reason"]) == ("reference", "it buckled")
-    assert "it buckled" in said.err
 
 
 def test_the_closure_study_measures_every_step(run):
