@@ -8,8 +8,8 @@ import pytest
 from experiments.common.building.closure import closure_model
 from experiments.common.building.gate import anatomy_digest, gate_of
 from experiments.common.places import GATE_RECORDS
-from experiments.common.records.record import NOT_GATED, Record, has_passed, read_record, stamp
-from experiments.common.records.writer import cautions, write_results
+from experiments.common.records.record import NOT_GATED, Record, read_record, stamp
+from experiments.common.records.writer import write_results
 from experiments.common.study import Result, Results
 from experiments.results.published import records_of, write_records
 from experiments.studies.gate import STUDY
@@ -105,24 +105,6 @@ def test_kept_verdicts_are_of_the_anatomies_as_they_ship():
         # Dilated and tethered leaflets alone leak; all others close, seen as predictions see them.
         (verdict,) = record.table_of().rows
         assert (verdict["gap"] == 0.0) == (record.row != "functional_mr")
-
-
-def test_what_has_not_passed_says_so_before_its_results():
-    values = settings("template")
-
-    def stamped(gate):
-        return stamp(values, "b" * 64, Result(row=f"on {gate}", gate=gate), 0.0)
-
-    passed, failed = stamped("passed on 54 x 6 hex18"), stamped("NOT passed on 54 x 6 hex18")
-    never, none = stamped(NOT_GATED), stamped(None)
-    assert [has_passed(r.gate) for r in (passed, failed, never)] == [True, False, None]
-    assert passed.caution == none.caution == ""
-    assert "did NOT pass the gate (NOT passed on 54 x 6 hex18)" in failed.caution
-    assert "experiment=gate" in never.caution
-    # Of several, those that it is said of are named.
-    assert cautions([failed]) == [failed.caution]
-    assert cautions([passed, failed]) == [f"on NOT passed on 54 x 6 hex18: {failed.caution}"]
-    assert cautions([passed, none]) == []
 
 
 def test_each_case_changes_its_own_setting_only():

@@ -168,15 +168,6 @@ def test_errors_of_moduli_from_all_sources():
     assert found["the known geometry, E_f.anterior"]["median error"] == pytest.approx(2.0)
 
 
-def test_what_the_verdict_denies_is_neither_stated_nor_counted():
-    denied = record("one", MODULI, (5.2, 2.1), (5.5, 2.0), verdict=Verdict(NONE))
-    first, _ = rows([denied])
-    assert (first["stated"], first["estimate"]) == (None, 6.0)
-    assert rows([denied], "skill")[0]["estimated"] == 0
-    verdicts = rows([denied], "verdicts")
-    assert [(row["verdict"], row["inside"], row["n"]) for row in verdicts] == [(NONE, 1, 2)]
-
-
 def test_bias_and_how_far_estimates_follow_the_truth():
     # Half of the truth's logarithm, and 0.1 too much of each; also where the verdict denies.
     truth = np.array([1.0, 2.0, 4.0, 8.0])
