@@ -49,9 +49,5 @@ def _read(values: Mapping[str, Any]) -> ValveCase:
 
 
 STUDY = Study(
-    settings=Settings,
-    run=run,
-    words=case_words,
-    files=write_report,
-    checks=lambda: (check_case,),
+    settings=Settings, run=run, words=case_words, files=write_report, checks=lambda: (check_case,)
 )

@@ -46,9 +46,5 @@ def check_volume(values: Mapping[str, Any], folder: Path) -> str:
 
 
 STUDY = Study(
-    settings=Settings,
-    run=run,
-    words=case_words,
-    files=write_report,
-    checks=lambda: (check_volume,),
+    settings=Settings, run=run, words=case_words, files=write_report, checks=lambda: (check_volume,)
 )

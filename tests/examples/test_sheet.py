@@ -103,13 +103,7 @@ def test_inadmissible_moduli_are_a_reason(model):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"thickness": float("nan")},
-        {"poisson": 0.5},
-        {"cells": (3, 2)},
-        {"load_steps": 0},
-    ],
+    "change", [{"thickness": float("nan")}, {"poisson": 0.5}, {"cells": (3, 2)}, {"load_steps": 0}]
 )
 def test_an_inadmissible_sheet_is_refused(change):
     with pytest.raises(InputError, match=next(iter(change))):

@@ -58,12 +58,7 @@ def looked_at(page: Path) -> Seen:
     return Seen(look_at(page.as_uri(), "--dump-dom"))
 
 
-STEP = {
-    "unlike": LONG,
-    "sentences": [LONG],
-    "files": [LONG, f"javascript:{RUN}"],
-    "volume": LONG,
-}
+STEP = {"unlike": LONG, "sentences": [LONG], "files": [LONG, f"javascript:{RUN}"], "volume": LONG}
 """From images to a valve, all of whose words are an attack."""
 
 

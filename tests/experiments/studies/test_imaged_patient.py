@@ -14,14 +14,7 @@ from experiments.common.schema import build
 from experiments.common.study import Job, Results
 from experiments.results.published import publish, records_of
 from experiments.studies import imaged_patient
-from experiments.studies.imaged_patient import (
-    HIDDEN,
-    KNOWN,
-    SEGMENTED,
-    STUDY,
-    VOLUME,
-    summary,
-)
+from experiments.studies.imaged_patient import HIDDEN, KNOWN, SEGMENTED, STUDY, VOLUME, summary
 from experiments.studies.imaged_patient import TRUTH as TRUTH_FOLDER
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown

@@ -12,11 +12,7 @@ from experiments.run import main
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore
 from experiments.studies.imaging.study import Settings, calibrated, error_rows, judge, kind_rows
 from mvest.errors import InputError
-from mvest.imaging.detection.trained_model import (
-    DetectionModel,
-    load_model,
-    save_model,
-)
+from mvest.imaging.detection.trained_model import DetectionModel, load_model, save_model
 from mvest.simulation.trials import KINDS, WITHOUT_VALVE
 from tests.experiments.configured import composed, plain
 
