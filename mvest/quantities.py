@@ -42,9 +42,8 @@ class Within:
         return AfterValidator(self.check).__get_pydantic_core_schema__(source, handler)
 
 
-def within(low: float, high: float, unit: str, why: str) -> Within:
-    """The range of a type of settings; both ends are admissible."""
-    return Within(low, high, unit, why)
+within = Within
+"""The range of a type of settings; both ends are admissible."""
 
 
 # Meshes and points.
