@@ -42,9 +42,8 @@ class Within:
         return AfterValidator(self.check).__get_pydantic_core_schema__(source, handler)
 
 
-def within(low: float, high: float, unit: str, why: str) -> Within:
-    """The range of a type of settings; both ends are admissible."""
-    return Within(low, high, unit, why)
+within = Within
+"""The range of a type of settings; both ends are admissible."""
 
 
 # Meshes and points.
@@ -65,7 +64,6 @@ Place: TypeAlias = Annotated[float, within(-1000, 1000, "mm", "coordinates in a 
 Thickness: TypeAlias = Annotated[float, within(0.01, 10, "mm", "no leaflet is thicker")]
 Thicknesses: TypeAlias = Annotated[float, within(0, 20, "", "multiples of the thickness")]
 Angle: TypeAlias = Annotated[float, within(-360, 360, "degrees", "once around")]
-Speed: TypeAlias = Annotated[float, within(0, 10_000, "mm/s", "no leaflet is faster")]
 
 # Loads and times.
 Pressure: TypeAlias = Annotated[

@@ -55,6 +55,8 @@ def test_moduli_of_a_template_from_how_it_closes() -> None:
 
 
 def test_moduli_of_an_own_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvest.personalisation.record.clinical_measurements", lambda *_: {})
+    monkeypatch.setattr("mvest.reporting.figures.DPI", 30)
     use(monkeypatch)  # a formula instead of a closure
     mvest.write_case(tmp_path / "case", made_up_case(0.01, displaced=False))
     case = mvest.read_case(tmp_path / "case")

@@ -94,11 +94,7 @@ SMALL_PATIENT = (
 )
 PATIENT = ("experiment=patients", "patient=normal_small", "hydra.mode=RUN")
 VOLUME = ("experiment=volume", "volume=examples/volume.seq.nrrd", "imaged.pressure_mmHg=120")
-FEWER = (
-    "imaged.error_samples=20",
-    "personal.nuisance_geometry=null",
-    "personal.moduli_only=false",
-)
+FEWER = ("imaged.error_samples=20", "personal.nuisance_geometry=null", "personal.moduli_only=false")
 OWN = ("experiment=own_valve", "case=examples/case")
 # An unstructured mesh, this experiment's default, is made by a mesher that is not deterministic.
 STRUCTURED = "personal.mesh.source=structured"
@@ -107,12 +103,7 @@ RUNS = {
     "table1": Run(("experiment=table1",)),
     "table1_independent": Run(("experiment=table1_independent",), slow=True),
     "sweep": Run(
-        (
-            "sweep=debug",
-            "filter.initial=[5,3],[4,2]",
-            "seed=1,2,3,4",
-            "observation.noise_mm=0.05",
-        )
+        ("sweep=debug", "filter.initial=[5,3],[4,2]", "seed=1,2,3,4", "observation.noise_mm=0.05")
     ),
     "own_valve_coarse": Run((*OWN, "personal=carried", *COARSE)),
     "own_valve": Run((*OWN, STRUCTURED), slow=True),

@@ -316,20 +316,6 @@ def test_wrong_imports_are_seen(module: str, source: str, count: int) -> None:
     assert len(import_violations(source, module, is_package=module == "mvest")) == count
 
 
-@pytest.mark.parametrize(
-    ("module", "is_package", "source", "expected"),
-    [
-        ("a.b.c", False, "from . import d", "a.b.d"),
-        ("a.b", True, "from . import d", "a.b.d"),
-        ("a.b.c", False, "from ..d import e", "a.d.e"),
-    ],
-)
-def test_relative_imports_are_resolved(
-    module: str, is_package: bool, source: str, expected: str
-) -> None:
-    assert [found.name for found in imports(source, module, is_package)] == [expected]
-
-
 def through_faces(source: str, module: str, faces: dict[str, set[str]]) -> list[str]:
     """Names that a module takes from a lazy face instead of the module that defines them."""
     return [
@@ -445,19 +431,6 @@ def test_what_is_imported_is_declared(project: dict) -> None:
         for message in undeclared(path.read_text(encoding="utf-8"), module, required, optional)
     ]
     assert messages == []
-
-
-@pytest.mark.parametrize(
-    ("source", "count"),
-    [
-        ("import os, numpy.linalg", 0),
-        ("import pyvista", 1),
-        ("def view():\n    import pyvista", 0),
-        ("def view():\n    import seaborn", 1),
-    ],
-)
-def test_an_undeclared_import_is_seen(source: str, count: int) -> None:
-    assert len(undeclared(source, "mvest.reporting.views", {"numpy"}, {"pyvista"})) == count
 
 
 def test_the_lock_file_fits_the_declared_dependencies(project: dict) -> None:

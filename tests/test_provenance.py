@@ -11,14 +11,7 @@ import pytest
 
 from mvest import provenance as module
 from mvest.errors import InputError
-from mvest.provenance import (
-    config_hash,
-    git_state,
-    provenance,
-    require_sealed,
-    sealed,
-    write_json,
-)
+from mvest.provenance import config_hash, git_state, provenance, require_sealed, sealed, write_json
 
 
 def git(folder: Path, *arguments: str) -> str:

@@ -22,12 +22,7 @@ from experiments.common.schema import NOT_HASHED, InputFile, Reads, Values, buil
 from experiments.common.study import Job, Result, Results, Study
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
-from mvest.exchange.external.contract import (
-    Command,
-    files_of_command,
-    read_points,
-    write_points,
-)
+from mvest.exchange.external.contract import Command, files_of_command, read_points, write_points
 from mvest.exchange.external.model import Differences, ProcessModel
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import Problem, estimate

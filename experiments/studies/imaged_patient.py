@@ -59,11 +59,7 @@ from mvest.simulation.imaged_patient import (
 )
 from mvest.simulation.motion import DrawnValve, MotionSettings
 from mvest.simulation.population import draw_tip_motion
-from mvest.simulation.virtual_patient import (
-    PatientSettings,
-    draw_patient_values,
-    first_that_closes,
-)
+from mvest.simulation.virtual_patient import PatientSettings, draw_patient_values, first_that_closes
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 
@@ -327,7 +323,7 @@ STUDY = Study(
     figure=lambda results: {"moduli": groups_figure(_by_source(results, verdict_of_volume=True))},
     captions={
         "moduli": "Estimates with their 95 % intervals over the truth, in the colour of the "
-        "verdict on the one from the volume. Simulated.",
+        "verdict on the one from the volume. Simulated."
     },
     words=case_words,
     files=write_report,

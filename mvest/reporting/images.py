@@ -69,10 +69,7 @@ OVER_TIME = {
         "commissural_diameter_mm": "commissural",
     },
     "Annulus height": {"annulus_height_mm": "height"},
-    "Closed leaflets": {
-        "tenting_height_mm": "tenting height",
-        "billow_height_mm": "billow height",
-    },
+    "Closed leaflets": {"tenting_height_mm": "tenting height", "billow_height_mm": "billow height"},
     "Orifice": {"orifice_mm2": "seen from the atrium"},
     "Coaptation": {"coaptation_length_mm": "length in the middle"},
     "Leaflet areas": {"anterior_area_mm2": "anterior", "posterior_area_mm2": "posterior"},

@@ -24,20 +24,17 @@ HALF = float(norm.ppf(0.975))
 """Standard deviations from the middle of a 95 % interval to its end."""
 
 
-def generic_guess(unknown: Unknown) -> Unknown:
-    """The unknown with the mean of its prior as the estimate, without an interval."""
-    nothing: dict[str, None] = dict.fromkeys(("std", "low", "high"))
-    return unknown.model_copy(update={"estimate": unknown.prior_mean, **nothing})
-
-
 def prior_alone(unknown: Unknown) -> Unknown:
-    """The unknown with the 95 % interval of its prior, which is log-normal if it is positive."""
-    guess, mean, std = generic_guess(unknown), unknown.prior_mean, unknown.prior_std
-    if mean is None or std is None:
-        return guess
-    factor, reach = (float(np.exp(HALF * std / mean)) if mean else 1.0), HALF * std
-    ends = (mean / factor, mean * factor) if unknown.is_positive else (mean - reach, mean + reach)
-    return guess.model_copy(update={"std": std, **dict(zip(("low", "high"), ends, strict=True))})
+    """The unknown with the mean and 95 % interval of its prior, log-normal if it is positive."""
+    mean, std = unknown.prior_mean, unknown.prior_std
+    ends: tuple[float | None, float | None] = (None, None)
+    if mean is not None and std is not None:
+        factor, reach = (float(np.exp(HALF * std / mean)) if mean else 1.0), HALF * std
+        positive = unknown.is_positive
+        ends = (mean / factor, mean * factor) if positive else (mean - reach, mean + reach)
+    low, high = ends
+    prior = {"estimate": mean, "std": None if low is None else std, "low": low, "high": high}
+    return unknown.model_copy(update=prior)
 
 
 def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:

@@ -1,16 +1,14 @@
-r"""The same sheet in mvest and in two independent finite element libraries, timed side by side.
+r"""The same sheet in mvest and in another finite element library, timed side by side.
 
 A square sheet of linear tetrahedra, clamped on its four sides, is inflated from below by a follower
 pressure in one static step. All libraries get the same nodes, elements, law (St Venant-Kirchhoff),
 load and convergence criterion, and start from the flat sheet; so the deflections must agree, and
-what differs is the time. The peers are felupe and NGSolve; one that is not installed gets a row
-that says so. One more row per mesh factorises and solves mvest's tangent and does nothing else:
-what an iteration with this direct solver costs at least.
+what differs is the time. The peer is felupe; if it is not installed, its row says so. One more row
+per mesh factorises and solves mvest's tangent and does nothing else: the least cost of an iteration
+with this direct solver.
 
-felupe solves with PARDISO, as its documentation advises. NGSolve has an energy compiled by C++, if
-its compiler driver ``ngscxx`` is on the path, and its own sparse Cholesky factorisation: the
-fastest of its forms and solvers that were tried. What is set up once (mesh, sparsity pattern,
-compiled terms) is not timed; the symbolic analysis of the matrix is. All take turns, so that a busy
+felupe solves with PARDISO, as its documentation advises. What is set up once (mesh, sparsity
+pattern) is not timed; the symbolic analysis of the matrix is. All take turns, so that load of the
 machine slows all of them alike.
 
     python -m tests.benchmark.peers [OUTPUT.json]
@@ -288,78 +286,6 @@ def _felupe_underside(sheet: Sheet) -> Any:
     return region
 
 
-def with_ngsolve(sheet: Sheet) -> Candidate:
-    """The sheet in NGSolve."""
-    import ngsolve as ng
-    from netgen.meshing import NgException
-
-    mesh = _ngsolve_mesh(sheet)
-    space = ng.VectorH1(mesh, order=1)
-    n = len(sheet.nodes)
-    free = ng.BitArray(space.ndof)
-    free.Set()
-    for axis in range(3):
-        for node in sheet.clamped:
-            free.Clear(int(axis * n + node))
-    at_free = np.array(free, dtype=bool)
-    u, v = space.TnT()
-    f = ng.Id(3) + ng.Grad(u)
-    green = 0.5 * (f.trans * f - ng.Id(3))
-    energy = 0.5 * LAMBDA * ng.Trace(green) ** 2 + MU * ng.InnerProduct(green, green)
-    f_under = ng.Id(3) + ng.Grad(u).Trace()
-    push = ng.InnerProduct(ng.Cof(f_under) * ng.CF((0, 0, -1)), v.Trace())
-    # One point per element and face integrates both terms exactly. With all sides clamped the
-    # load stiffness is symmetric, so that half the matrix suffices.
-    one = {ng.TET: ng.IntegrationRule(ng.TET, 1), ng.TRIG: ng.IntegrationRule(ng.TRIG, 1)}
-    form = ng.BilinearForm(space, symmetric=True)
-    try:
-        options = {"realcompile": True, "wait": True}
-        energy, push, how = energy.Compile(**options), push.Compile(**options), "compiled by C++"
-    except NgException:
-        energy, push, how = energy.Compile(), push.Compile(), "interpreted: no C++ compiler"
-    form += ng.Variation(energy * ng.dx(intrules=one))
-    form += PRESSURE * push * ng.ds("under", intrules=one)
-    position = ng.GridFunction(space)
-    residual, step = position.vec.CreateVector(), position.vec.CreateVector()
-
-    def solve() -> Solved:
-        position.vec[:] = 0.0
-        inverse = None
-        for iteration in range(MAX_ITERATIONS + 1):
-            form.Apply(position.vec, residual)
-            entries = residual.FV().NumPy()
-            if np.linalg.norm(entries[at_free]) <= TOLERANCE * np.linalg.norm(entries):
-                return Solved(iteration, float(position.vec.FV().NumPy()[2 * n + sheet.centre]))
-            form.AssembleLinearization(position.vec)
-            if inverse is None:
-                inverse = form.mat.Inverse(free, inverse="sparsecholesky")
-            else:
-                inverse.Update()
-            step.data = inverse * residual
-            position.vec.data -= step
-        raise RuntimeError("NGSolve: Newton's method did not converge")
-
-    note = f"solver sparsecholesky; terms {how}"
-    return Candidate("ngsolve", metadata.version("ngsolve"), note, solve)
-
-
-def _ngsolve_mesh(sheet: Sheet) -> Any:
-    """The mesh with its underside as the only boundary, nodes in the order of the sheet."""
-    import ngsolve as ng
-    from netgen import meshing
-
-    mesh = meshing.Mesh(dim=3)
-    points = [mesh.Add(meshing.MeshPoint(meshing.Pnt(*map(float, x)))) for x in sheet.nodes]
-    mesh.Add(meshing.FaceDescriptor(surfnr=1, domin=1, domout=0, bc=1))
-    mesh.SetBCName(0, "under")
-    mesh.SetMaterial(1, "sheet")
-    for element in sheet.elements:
-        mesh.Add(meshing.Element3D(1, [points[k] for k in element]))
-    for face in sheet.under:
-        mesh.Add(meshing.Element2D(1, [points[k] for k in face]))
-    return ng.Mesh(mesh)
-
-
 def measure(sheet: Sheet) -> list[Row]:
     """Rows of all libraries, mvest first."""
     n = len(sheet.nodes)
@@ -394,7 +320,6 @@ def measure(sheet: Sheet) -> list[Row]:
 PREPARE: dict[str, Callable[[Sheet], Candidate]] = {
     "mvest": with_mvest,
     "felupe": with_felupe,
-    "ngsolve": with_ngsolve,
     "factor + solve alone": factor_alone,
 }
 

@@ -150,11 +150,7 @@ def test_a_frame_without_a_valve_keeps_its_row(volume):
 
 @pytest.mark.parametrize(
     ("count", "closed", "expected"),
-    [
-        (4, None, [0, 1, 2, 3]),
-        (11, 7, [0, 2, 4, 7, 8, 10]),
-        (101, 1, [0, 1, 40, 60, 80, 100]),
-    ],
+    [(4, None, [0, 1, 2, 3]), (11, 7, [0, 2, 4, 7, 8, 10]), (101, 1, [0, 1, 40, 60, 80, 100])],
 )
 def test_frames_are_even_and_hold_the_first_and_the_closed(count, closed, expected):
     assert chosen_frames(count, closed) == expected

@@ -1,14 +1,11 @@
 """Pages in a real browser whose every text is an attack: nothing runs, no page is broken."""
 
-import base64
-import io
 import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from mvest.reporting.case.report import report
 from tests.experiments.runner.screenshot import look_at
@@ -61,12 +58,7 @@ def looked_at(page: Path) -> Seen:
     return Seen(look_at(page.as_uri(), "--dump-dom"))
 
 
-STEP = {
-    "unlike": LONG,
-    "sentences": [LONG],
-    "files": [LONG, f"javascript:{RUN}"],
-    "volume": LONG,
-}
+STEP = {"unlike": LONG, "sentences": [LONG], "files": [LONG, f"javascript:{RUN}"], "volume": LONG}
 """From images to a valve, all of whose words are an attack."""
 
 
@@ -127,12 +119,3 @@ def test_characters_that_act_are_named_and_what_is_cut_is_said(case_page) -> Non
     assert not ACTING.search(text)
     assert "[U+202E]gnp.exe[U+202C]" in text
     assert "characters)" in text
-
-
-def test_pictures_stay_whole(case_page) -> None:
-    found = re.findall(
-        'src="data:image/webp;base64,([^"]*)"', case_page.read_text(encoding="utf-8")
-    )
-    assert found
-    for data in found:
-        Image.open(io.BytesIO(base64.b64decode(data, validate=True))).load()

@@ -3,7 +3,7 @@ import re
 import pytest
 from markdown_it import MarkdownIt
 
-from mvest.reporting.markup import markdown_rows, markdown_text, number
+from mvest.reporting.markup import markdown_rows, number
 from mvest.reporting.tables import table
 
 HOSTILE = r"<script>alert('x')</script> | `a` *b* [c](javascript:d) _e_ 5 % & $x$ \input{f} #1 ~"
@@ -18,11 +18,6 @@ def test_markdown_shows_hostile_text_as_it_stands() -> None:
     for escaped, character in (("&lt;", "<"), ("&gt;", ">"), ("&amp;", "&")):
         shown = shown.replace(escaped, character)
     assert shown == HOSTILE
-
-
-def test_ordinary_names_stay_legible_in_markdown() -> None:
-    assert markdown_text("error E_f.anterior [%]") == "error E_f.anterior [%]"
-    assert markdown_text("two\nlines") == "two lines"
 
 
 def test_latex_prints_every_special_character() -> None:

@@ -189,10 +189,7 @@ def summary(results: Results) -> dict[str, Table]:
             "estimates": _estimates(patients),
         }
     ways, frames = _by_way(estimates), _table3(patients)
-    both = {
-        "moduli": skill_table("estimation", unknowns_of(ways)),
-        "distances": _distances(frames),
-    }
+    both = {"moduli": skill_table("estimation", unknowns_of(ways)), "distances": _distances(frames)}
     if which == POPULATION:
         each = unknowns_of(ways, by_name=True, nuisances=True)
         return {

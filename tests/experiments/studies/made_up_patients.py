@@ -76,9 +76,7 @@ def patient(name: str = "normal_small", table: str = "patients", **changes: Any)
             distances("closed", True, 2.0, 1.5, 0.5),
             distances("late", False, 1.0, 0.4, 0.8),
         ),
-        "details": {
-            "measurements": ({"frame": "open", "annulus_area_mm2": 800.0},),
-        },
+        "details": {"measurements": ({"frame": "open", "annulus_area_mm2": 800.0},)},
     }
     numbers = changes.pop("numbers", {})
     estimate = EstimateRecord(**{**whole, **changes})

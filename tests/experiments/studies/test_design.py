@@ -71,6 +71,8 @@ def test_all_designs_are_recorded_and_some_are_tried(made_up, tmp_path):
         # In percent of the prior's standard deviation of the logarithm.
         ratio = np.log(own.estimate / own.truth) / np.log(own.prior_mean / own.truth)
         assert row["error"] / row["generic"] == pytest.approx(ratio)
+        off = 100 * np.log(own.prior_mean / own.truth) / (own.prior_std / own.prior_mean)
+        assert row["generic"] == pytest.approx(off, rel=0.01)
         assert row["reported"] / row["error"] == pytest.approx(
             own.std / own.estimate / np.log(own.estimate / own.truth)
         )

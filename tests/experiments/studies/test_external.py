@@ -160,20 +160,6 @@ def test_several_models_estimate_from_what_one_of_them_predicts(tmp_path):
     assert "runs" not in result.table_of().rows[1]
 
 
-def test_a_model_without_derivatives_is_estimated_by_a_filter_that_needs_none(tmp_path):
-    source = MODELS.replace("Prediction(slope * t * m[0], slope * t[:, None])",
-                            "Prediction.undifferentiated(slope * t * m[0])")  # fmt: skip
-    (tmp_path / "models.py").write_text(source)
-    overrides = ("parameters=[k]", "filter=unscented", "filter.initial=[2.0]")
-    values = plain(composed("experiment=external", *overrides, "filter.P0=null", "filter.R=null"))
-    values["truth"]["values"] = [3.0]
-    model = ModelSettings(python=f"{tmp_path}/models.py:straight", settings={"slope": 1.0})
-    about = ExternalSettings(models={"one": model}, data=("one",), prior_std=(3.0,), noise_mm=0.01)
-    (found,) = STUDY.run(Job(values, Settings(external=about), tmp_path)).estimates
-    assert found.converged, found.reason
-    assert found.unknowns[0].estimate == pytest.approx(3.0, rel=0.01)
-
-
 @pytest.mark.parametrize(
     ("python", "message"), [("absent.py:f", "no such file"), ("models.py:f", "'f'")]
 )

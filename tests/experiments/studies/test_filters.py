@@ -6,38 +6,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.common.building.filters import build_filter
 from experiments.common.config import plain
 from experiments.common.records.record import read_record
 from experiments.common.schema import build
 from experiments.run import main
 from experiments.studies.filters import Settings, figure, run
 from mvest.errors import ConfigurationError
-from mvest.estimation import EnsembleFilter, ExtendedFilter, ImportanceFilter, UnscentedFilter
 from mvest.reporting.figures import BAD, GOOD
 from mvest.reporting.tables import table
 from tests.experiments.configured import composed
 from tests.experiments.studies.test_gate import SMALL
 
 NAMES = ("E_f.anterior", "E_f.posterior")
-
-
-@pytest.mark.parametrize(
-    ("name", "overrides", "expected"),
-    [
-        ("extended", [], ExtendedFilter()),
-        ("unscented", ["filter.method.spread=0.5"], UnscentedFilter(1e-3, 15, 0.5)),
-        ("ensemble_smoother", [], EnsembleFilter(24, 4)),
-        ("importance", ["+filter.method.runs=40"], ImportanceFilter(runs=40)),
-    ],
-)
-def test_a_configured_filter_is_the_filter(name, overrides, expected) -> None:
-    settings = plain(composed(f"filter={name}", *overrides))["filter"]
-    found, transform, prior = build_filter(settings, NAMES)
-    assert found == expected
-    # Prior and coordinates are those of the iterated filter, so that results compare.
-    assert prior.covariance[0, 0] == 9.0
-    assert transform.forward(np.ones(2)).tolist() == [0.0, 0.0]
 
 
 class MadeUpResults:

@@ -8,15 +8,14 @@ import pytest
 from experiments.common.building.closure import closure_model
 from experiments.common.building.gate import anatomy_digest, gate_of
 from experiments.common.places import GATE_RECORDS
-from experiments.common.records.record import NOT_GATED, Record, has_passed, read_record, stamp
-from experiments.common.records.writer import cautions, write_results
+from experiments.common.records.record import NOT_GATED, Record, read_record, stamp
+from experiments.common.records.writer import write_results
 from experiments.common.study import Result, Results
 from experiments.results.published import records_of, write_records
 from experiments.studies.gate import STUDY
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GATE_CASES, MAX_LIMIT, MEAN_LIMIT, GateCase
 from mvest.closure.smoothness import JUMP_LIMIT
-from mvest.estimation import Prediction
 from mvest.reporting.tables import table
 from tests.experiments.configured import composed, plain
 from tests.places import ANATOMIES
@@ -108,24 +107,6 @@ def test_kept_verdicts_are_of_the_anatomies_as_they_ship():
         assert (verdict["gap"] == 0.0) == (record.row != "functional_mr")
 
 
-def test_what_has_not_passed_says_so_before_its_results():
-    values = settings("template")
-
-    def stamped(gate):
-        return stamp(values, "b" * 64, Result(row=f"on {gate}", gate=gate), 0.0)
-
-    passed, failed = stamped("passed on 54 x 6 hex18"), stamped("NOT passed on 54 x 6 hex18")
-    never, none = stamped(NOT_GATED), stamped(None)
-    assert [has_passed(r.gate) for r in (passed, failed, never)] == [True, False, None]
-    assert passed.caution == none.caution == ""
-    assert "did NOT pass the gate (NOT passed on 54 x 6 hex18)" in failed.caution
-    assert "experiment=gate" in never.caution
-    # Of several, those that it is said of are named.
-    assert cautions([failed]) == [failed.caution]
-    assert cautions([passed, failed]) == [f"on NOT passed on 54 x 6 hex18: {failed.caution}"]
-    assert cautions([passed, none]) == []
-
-
 def test_each_case_changes_its_own_setting_only():
     config = plain(composed("experiment=gate", "mesh.columns=12", "mesh.rows=2"))
 
@@ -169,17 +150,6 @@ def test_the_gate_study_records_every_case(run):
     assert {"gate.csv", "gate.md"} <= {path.name for path in folder.iterdir()}
     for case in GATE_CASES:
         assert f"{case.name}: max" in said.err
-
-
-def test_a_reference_that_does_not_close_is_recorded_as_a_failure(run, monkeypatch):
-    monkeypatch.setattr(ClosureModel, "__call__", lambda self, m: Prediction.failed("it buckled"))
-    status, record, _, said = run("experiment=gate", *ONE)
-    assert status == 1
-    assert (record.status, record.reason) == ("failed", "it buckled")
-    assert record.numbers["passed"] is False
-    (reference,) = record.table_of("variations").rows
-    assert (reference["variation"], reference["reason"]) == ("reference", "it buckled")
-    assert "it buckled" in said.err
 
 
 def test_the_closure_study_measures_every_step(run):

@@ -14,14 +14,7 @@ from experiments.common.schema import build
 from experiments.common.study import Job, Results
 from experiments.results.published import publish, records_of
 from experiments.studies import imaged_patient
-from experiments.studies.imaged_patient import (
-    HIDDEN,
-    KNOWN,
-    SEGMENTED,
-    STUDY,
-    VOLUME,
-    summary,
-)
+from experiments.studies.imaged_patient import HIDDEN, KNOWN, SEGMENTED, STUDY, VOLUME, summary
 from experiments.studies.imaged_patient import TRUTH as TRUTH_FOLDER
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown
@@ -166,15 +159,6 @@ def test_errors_of_moduli_from_all_sources():
     assert volume["median error"] == pytest.approx(22.5)
     assert volume["generic guess"] == pytest.approx(65.0)
     assert found["the known geometry, E_f.anterior"]["median error"] == pytest.approx(2.0)
-
-
-def test_what_the_verdict_denies_is_neither_stated_nor_counted():
-    denied = record("one", MODULI, (5.2, 2.1), (5.5, 2.0), verdict=Verdict(NONE))
-    first, _ = rows([denied])
-    assert (first["stated"], first["estimate"]) == (None, 6.0)
-    assert rows([denied], "skill")[0]["estimated"] == 0
-    verdicts = rows([denied], "verdicts")
-    assert [(row["verdict"], row["inside"], row["n"]) for row in verdicts] == [(NONE, 1, 2)]
 
 
 def test_bias_and_how_far_estimates_follow_the_truth():

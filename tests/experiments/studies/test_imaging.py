@@ -12,13 +12,7 @@ from experiments.run import main
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore
 from experiments.studies.imaging.study import Settings, calibrated, error_rows, judge, kind_rows
 from mvest.errors import InputError
-from mvest.imaging.detection.trained_model import (
-    STAGES,
-    DetectionModel,
-    load_model,
-    save_model,
-)
-from mvest.reading.npz import read_npz
+from mvest.imaging.detection.trained_model import DetectionModel, load_model, save_model
 from mvest.simulation.trials import KINDS, WITHOUT_VALVE
 from tests.experiments.configured import composed, plain
 
@@ -102,21 +96,6 @@ def test_what_is_tested_on_was_not_trained_on(done: Path):
     assert len(set.union(*groups)) == sum(map(len, groups))
 
 
-def test_the_model_states_its_errors(done: Path):
-    model, record = load_model(done / "run" / "tee.npz"), record_of(done)
-    assert model.accuracy is not None
-    assert model.accuracy.samples.shape == (2, 2, 80, 3)
-    assert model.accuracy.tip_samples.shape == (2, 2, 2, 3)
-    assert (model.accuracy.std_mm > 0).all()
-    about = model.accuracy.samples - model.accuracy.samples.mean(axis=0)
-    std = np.sqrt((about**2).sum(axis=(0, 1, 3)) / 6)
-    assert model.accuracy.std_mm == pytest.approx(std, rel=1e-5)
-    length = record.numbers["correlation_length_mm"]
-    assert model.accuracy.correlation_length_mm == pytest.approx(length)
-    assert model.sha256 == record.numbers["model_sha256"]
-    assert model.trained_on["config_hash"] == record.provenance.config_hash
-
-
 def test_an_interrupted_study_goes_on_where_it_was(done: Path):
     again, before = done / "again", record_of(done)
     store = changed(done)
@@ -189,15 +168,6 @@ def test_cached_parts_are_named_by_what_they_are_made_of():
     assert other[0] == base[0]
     assert other[1] != base[1]
     assert not set(names("imaging.train.seed=9")) & set(base)
-
-
-def test_the_first_volumes_make_a_draft_whose_mistakes_the_others_add(done: Path):
-    files = (done / "outputs" / "detectors" / "samples").glob("*.npz")
-    samples = [read_npz(file) for file in files]
-    assert set(samples[0]) == {f"{stage}.{axis}" for stage in STAGES for axis in "xy"}
-    assert {len(each["boundary.x"]) for each in samples} == {60}
-    # Of six volumes three make the draft; six poses of each other one are mistakes.
-    assert sorted(len(each["pose_fine.y"]) for each in samples) == [24, 24, 24, 30, 30, 30]
 
 
 # -- tables of made-up trials ---------------------------------------------------------------------

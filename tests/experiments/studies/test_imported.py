@@ -9,10 +9,7 @@ import pytest
 from experiments.common.records.record import read_record
 from experiments.common.schema import build
 from experiments.run import main
-from experiments.studies.imported import (
-    DonorSettings,
-    recorded_valve,
-)
+from experiments.studies.imported import DonorSettings, recorded_valve
 from mvest.closure.robustness import GateReport, GateRow
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.valve.mesh.solid_mesh import embed

@@ -5,15 +5,12 @@ anywhere, as in a scanner's coordinates.
 """
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from experiments.common.study import Result
-from experiments.studies import case
 from mvest.closure.model import ClosureModel
 from mvest.exchange.surfaces import write_surface
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
@@ -92,36 +89,6 @@ def run(run):
     """Run the one command on a case: exit status, standard output and error."""
     own = ("experiment=own_valve", *COARSE)
     return lambda folder, *arguments: run(*own, f"case={folder}", *arguments)
-
-
-def test_a_finished_case_is_shown_again_until_its_files_change(run, tmp_path, monkeypatch, seen):
-    calls = []
-
-    def estimate(job):
-        calls.append(job.folder)
-        return Result(numbers={"a_mm": 1.0})
-
-    def report(folder, record):
-        (folder / "report.html").touch()
-        return []
-
-    monkeypatch.setattr(case, "STUDY", replace(case.STUDY, run=estimate, files=report))
-    folder = write(tmp_path / "mine", seen, Scanner(3))
-    here = ("time_limit_s=null", "tracking.enabled=false")
-    status, first, err = run(folder, *here)
-    assert status == 0, err
-    # With its usual time limit, too.
-    for more in (here, here[1:]):
-        status, again, err = run(folder, *more)
-        assert (status, len(calls)) == (0, 1), err
-        assert again.startswith(first)
-        assert first.endswith(f"a mm: 1\nWritten to {calls[0]}\nReport: {calls[0]}/report.html\n")
-    assert run(folder, *here, "force=true")[0] == 0
-    assert calls == [calls[0]] * 2
-    with (folder / "case.yaml").open("a") as file:
-        file.write("description: seen again\n")
-    assert run(folder, *here)[0] == 0
-    assert calls[2] != calls[0]
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """Virtual patients: hidden before the estimation, revealed after it."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from experiments.common.records.record import stamp
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.patient import study as patient
-from experiments.studies.patient.study import Settings, reveal, run_patient
+from experiments.studies.patient.study import Settings, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import GeometryError
 from mvest.problem.verdict import ONE_STATE
@@ -240,38 +239,3 @@ def test_a_failed_estimation_is_revealed_too(tmp_path, out, simulated, in_proces
     assert result.numbers["nees"] is None
     kept = patient.keep(stamp(values, "hash", result, 0.0))
     assert kept.estimates[0].moduli == result.estimates[0].moduli
-
-
-SMALLEST = (
-    "patient.simulation.columns=16", "patient.simulation.rows=2",
-    "patient.simulation.dt_factor=1", "patient.simulation.contact_columns=60",
-    "patient.simulation.contact_rows=16", "patient.simulation.seen_columns=32",
-    "patient.simulation.seen_rows=9", "patient.simulation.held_pressure_mmHg=[95]",
-    "patient.simulation.held_relaxation=[0.1]", "patient.deviations.pressure=0.02",
-    "patient.deviations.chord_stiffness=0.02", "patient.deviations.chord_rest_length=0.002",
-    "valve=template", "personal=moduli", "personal.moduli_only=false", "personal.confirm=false",
-    "personal.mesh.columns=16", "personal.mesh.rows=2", "personal.mesh.guide_columns=16",
-    "personal.mesh.guide_rows=2", "personal.mesh.contact_columns=60",
-    "personal.mesh.contact_rows=16", "personal.max_iterations=2",
-    "mechanics.protocol.pressure_mmHg=100", "mechanics.protocol.ramp=0.2",
-    "mechanics.protocol.dt=0.04", "mechanics.protocol.growth=2", "mechanics.protocol.end=0.4",
-)  # fmt: skip
-
-
-@pytest.mark.slow
-def test_the_estimate_is_the_same_where_there_is_no_truth_to_see(tmp_path):
-    config = config_of(tmp_path, *SMALLEST)
-    config["personal"]["paper"] = None
-    place = make_patient(config)
-    found = []
-    for name in ("one", "two"):
-        out = tmp_path / name
-        out.mkdir()
-        result = patient.estimate_blindly(config, out, place.case, place.hidden)
-        found.append(result.estimates[0])
-        if name == "one":
-            revealed = reveal(result, place, settings_in(config), 1)
-            shutil.rmtree(place.hidden)
-    one, two = (record.model_copy(update={"seconds": 0.0, "details": {}}) for record in found)
-    assert one == two
-    assert [row.truth for row in revealed.estimates[0].unknowns[:2]] == [6.28, 2.61]

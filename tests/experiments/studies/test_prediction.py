@@ -156,16 +156,6 @@ def test_samples_that_fail_are_stated(run, monkeypatch):
     prediction.figure(Results({"prediction": record}, {"prediction": folder / "fields.npz"}))
 
 
-def test_a_valve_that_cannot_be_simulated_is_recorded_as_a_failure(run, monkeypatch):
-    monkeypatch.setattr(ClosureModel, "close", buckled)
-    status, record, _, _ = run()
-    assert status == 1
-    assert record.status == "failed"
-    assert StepReason.SINGULAR.value in record.reason
-    assert len(record.table_of()) == 0
-    assert [row["valve"] for row in record.table_of("not_closed").rows] == ["estimate"] * 2
-
-
 def test_an_interval_without_width_counts_only_where_it_misses():
     def row(low, high, truth, measure="gap_mm2"):
         return {

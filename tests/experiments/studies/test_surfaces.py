@@ -195,17 +195,6 @@ RESULTS = Results(
 )
 
 
-def test_what_is_not_stated_is_not_counted():
-    found = {row["geometry"]: row for row in summary(RESULTS)["geometries"].rows}
-    vertices, slicer, labels = found["vertices"], found["SlicerHeart"], found["labels"]
-    assert (vertices["inside"], vertices["estimated"]) == (2, 2)
-    assert vertices["median error"] == pytest.approx(5.0)
-    assert (slicer["inside"], slicer["median error"]) == (1, pytest.approx(25.0))
-    # Errors of estimates whose verdict is none would be 50 % and 0 %.
-    assert (labels["n"], labels["estimated"], labels["median error"]) == (4, 0, None)
-    assert (labels[NONE], slicer[DOUBTFUL], vertices[TRUSTWORTHY]) == (2, 1, 1)
-
-
 def test_the_table_has_every_modulus_of_every_run_by_patient_and_way():
     rows = summary(RESULTS)[""].rows
     assert [row["geometry"] for row in rows[::2]] == ["vertices", "SlicerHeart", "labels", "labels"]

@@ -16,12 +16,7 @@ from mvest.reporting.case.drawing import (
     leak_of,
     quartered,
 )
-from mvest.reporting.case.figures import (
-    case_figure,
-    estimates_figure,
-    frames_figure,
-    shapes_figure,
-)
+from mvest.reporting.case.figures import case_figure, estimates_figure, frames_figure, shapes_figure
 from mvest.reporting.case.view import case_view, states_of
 from mvest.reporting.figures import ATRIUM, SIDE
 from tests.made_up_closure import made_up_case as case_of_frames
