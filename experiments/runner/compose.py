@@ -90,7 +90,7 @@ def make_plan(
     is_group = cache(lambda name: bool(loader.get_group_options(name)))
     merged: dict[tuple[str, ...], DictConfig] = {}
     planned: list[Request] = []
-    with PartBar(f"{config.name}, composing", len(jobs), "job") as bar:
+    with PartBar(f"{config.name}, composing", len(jobs), "job", quiet=True) as bar:
         for number, overrides in enumerate(jobs, first):
             bar.step()
             parsed = {one.get_key_element(): one for one in map(parse, overrides)}

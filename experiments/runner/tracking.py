@@ -207,7 +207,7 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     jobs: Any = plan["jobs"] if plan else [{"folder": "", "overrides": _typed(folder)}]
     shown = jobs if len(jobs) <= MANY else []
     with (
-        PartBar(f"{name}, to MLflow", len(shown), "run") as bar,
+        PartBar(f"{name}, to MLflow", len(shown), "run", quiet=True) as bar,
         opened(tracking["uri"], outputs, name),
     ):
         known = runs_of(name, "" if plan else f"tags.folder = '{folder.resolve().name}'")

@@ -178,7 +178,7 @@ def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, mon
 def test_a_study_without_data_cannot_be_checked(run):
     status, _, err = run("experiment=closure", "check=true")
     assert status == 2
-    assert "experiment closure: check=true has nothing to say of a study of the kind gate" in err
+    assert "experiment closure: a study of the kind gate has no check=true" in err
     assert "expected one of case, cycle, " in err
 
 
