@@ -176,19 +176,7 @@ def _left_out(path: Path, error: Exception) -> int:
 
 
 class Entry(NamedTuple):
-    """A run for MLflow.
-
-    Attributes
-    ----------
-    result : Path
-    name : str
-    tags : mapping
-        The first one identifies the run.
-    settings : mapping
-    numbers : mapping
-        Metrics.
-    seconds : float
-    """
+    """A run for MLflow; its first tag identifies it, ``seconds`` is the time of its computation."""
 
     result: Path
     name: str
