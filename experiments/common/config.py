@@ -260,17 +260,9 @@ def is_hashed(key: str, study: str | None) -> bool:
 
 
 def require_in_range(values: Mapping[str, Any]) -> None:
-    """Refuse a configuration with a number outside its range, or an unusable text.
+    """Refuse resolved plain data with a number outside its range, or an unusable text.
 
-    Parameters
-    ----------
-    values : mapping
-        Plain data, resolved.
-
-    Raises
-    ------
-    ConfigurationError
-        One line with the setting, its value and the range.
+    Raises a `ConfigurationError`: one line with the setting, its value and the range.
     """
     _require_names(values)
     kinds = _kinds(values.get("study"))

@@ -28,7 +28,7 @@ TYPICAL_SOLVES = 6
 """Forward solves that a filter usually needs; only the first guess of what is left."""
 
 QUICK_S = 1.0
-"""What ends sooner than this after the last line gets no line."""
+"""A forward solve that ends sooner than this after the last line gets no line."""
 
 
 def duration(seconds: float) -> str:
@@ -197,10 +197,15 @@ class PartBar:
     unit : str
     workers : int
         Number of pieces in work at a time.
+    quiet : bool
+        Write no line at the end.
     """
 
-    def __init__(self, title: str, total: int, unit: str, workers: int = 1) -> None:
+    def __init__(
+        self, title: str, total: int, unit: str, workers: int = 1, *, quiet: bool = False
+    ) -> None:
         self._title, self._total, self._unit, self._workers = title, total, unit, workers
+        self._quiet = quiet
         self._done, self._spent = 0, 0.0
         self._began = self._last = time.monotonic()
         # tqdm's own estimate of the time left knows no workers.
@@ -213,8 +218,8 @@ class PartBar:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._lines.end()
-        if kind is None and (spent := time.monotonic() - self._began) > QUICK_S:
-            say(f"{self._title}: done in {duration(spent)}")
+        if kind is None and not self._quiet:
+            say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")
 
     def step(self, total: int | None = None, seconds: float | None = None) -> None:
         """One more piece is done, of ``total`` if given; it took ``seconds``, if given."""

@@ -83,14 +83,8 @@ InputFile = Annotated[str | None, Reads(contents)]
 def with_contents(kinds: Mapping[str, Any], values: Values, *, hashed: bool) -> dict[str, Any]:
     """Values with file contents in place of names, and whole numbers as ints.
 
-    Parameters
-    ----------
-    kinds : mapping
-        Setting -> its type with its marks.
-    values : mapping
-        Plain data. 1 and 1.0 become one setting in a hash.
-    hashed : bool
-        Whether settings that change no result are left out.
+    So 1 and 1.0 are one setting in a hash. ``kinds`` maps settings to types with their marks;
+    ``hashed`` leaves out settings that change no result.
     """
     found: dict[str, Any] = {}
     for name, value in values.items():
@@ -148,17 +142,8 @@ _adapter = cache(TypeAdapter)
 def validated(kind: Any, value: Any, key: str = "") -> Any:
     """A value of a type from plain data; names that a dataclass does not have are ignored.
 
-    Parameters
-    ----------
-    kind : type
-    value : plain data
-    key : str
-        Dotted name of the value.
-
-    Raises
-    ------
-    MvestError
-        One line with the setting, its value and what is admissible.
+    ``key`` is the dotted name of the value. Raises an `MvestError`: one line with the setting, its
+    value and what is admissible.
     """
     try:
         return _adapter(kind).validate_python(value)
@@ -189,18 +174,8 @@ def build(cls: type[T], values: Values) -> T:
 def from_words(command: str, cls: type[T], words: Sequence[str], others: Sequence[str] = ()) -> T:
     """The frozen ``cls`` from words NAME=VALUE of a command, with values as in YAML.
 
-    Parameters
-    ----------
-    command : str
-    cls : type
-    words : sequence of str
-    others : sequence of str
-        Further names that the command knows, for the message.
-
-    Raises
-    ------
-    MvestError
-        A word of another form, an unknown name, or an inadmissible value.
+    Raises an `MvestError` for a word of another form, an unknown name (the message lists the known
+    ones and the ``others`` of the command), or an inadmissible value.
     """
     defaults = OmegaConf.structured(schema(typing.cast(Any, cls)))
     for word in words:
@@ -224,10 +199,7 @@ def defaults_of(cls: type) -> str:
 def require_admissible_values(kind: Any, value: Any, key: str = "") -> None:
     """Refuse values of a schema with a number outside its range, or an unusable text.
 
-    Raises
-    ------
-    MvestError
-        As `validated`.
+    Raises an `MvestError` as `validated`.
     """
     validated(kind, value, key)
     _require_plain(value, key)

@@ -31,16 +31,8 @@ STUDIES = Path(experiments.studies.__file__).parent
 class Job(Generic[S]):
     """The input of a study.
 
-    Attributes
-    ----------
-    values : mapping
-        The resolved configuration as plain data.
-    settings : S
-        The study's own part of it.
-    folder : Path
-        Output folder, which exists.
-    config_hash : str
-        For studies that write files next to their record.
+    ``values`` is the resolved configuration as plain data, ``settings`` the study's own part of it;
+    ``folder``, the output folder, exists.
     """
 
     values: Mapping[str, Any]

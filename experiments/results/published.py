@@ -66,17 +66,9 @@ def as_configured(config: DictConfig) -> bool:
 
 
 def publish_runs(runs: Iterable[tuple[str | None, Record | None, Path, Path]]) -> None:
-    """Publish runs.
+    """Publish runs: name (None: do not publish), record, folder, and folder of the results.
 
-    Parameters
-    ----------
-    runs : iterable of tuple
-        Name (None: do not publish), record, folder, and folder of the results.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
+    Raises an `InputError` if a file cannot be written.
     """
     groups: dict[tuple[Path, str, str], dict[str, tuple[Record, Path]]] = {}
     for name, record, folder, results in runs:
@@ -108,18 +100,8 @@ def publish(
 ) -> list[Path]:
     """Publish records of one table, and write again what follows from them.
 
-    Parameters
-    ----------
-    study : Study
-    results : Path
-        The folder of all results; made if missing.
-    runs : mapping
-        Name -> record and output folder of each run, at least one.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
+    ``runs`` maps names to record and output folder of at least one run; the folder of all results
+    is made if missing. Raises an `InputError` if a file cannot be written.
     """
     (table,) = {record.table for record, _ in runs.values()}
     place = results / RECORDS

@@ -60,24 +60,11 @@ def make_plan(
     first: int = 0,
     workers: int = 1,
 ) -> Plan:
-    """Compose jobs.
+    """Compose jobs from the overrides of each.
 
-    Parameters
-    ----------
-    config : DictConfig
-        The sweep's own configuration, with Hydra's part.
-    loader : ConfigLoader
-    jobs : sequence of sequence of str
-        The overrides of each.
-    first : int
-        Number of the first of them in the sweep.
-    workers : int
-        Jobs that will run at a time.
-
-    Raises
-    ------
-    HydraException, OmegaConfBaseException
-        If a job cannot be composed.
+    ``config`` is the sweep's own configuration with Hydra's part, ``first`` the number of the first
+    job in the sweep, and ``workers`` the number of jobs that will run at a time. Raises Hydra's and
+    OmegaConf's errors if a job cannot be composed.
     """
     swept = config.hydra.sweeper.get("params") or {}
     # Unresolved, because an interpolation can be resolved only within a job.
@@ -90,7 +77,7 @@ def make_plan(
     is_group = cache(lambda name: bool(loader.get_group_options(name)))
     merged: dict[tuple[str, ...], DictConfig] = {}
     planned: list[Request] = []
-    with PartBar(f"{config.name}, composing", len(jobs), "job") as bar:
+    with PartBar(f"{config.name}, composing", len(jobs), "job", quiet=True) as bar:
         for number, overrides in enumerate(jobs, first):
             bar.step()
             parsed = {one.get_key_element(): one for one in map(parse, overrides)}

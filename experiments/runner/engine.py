@@ -127,15 +127,7 @@ def run_jobs(
     """Run jobs; yields the position of each and the head of its record, as they end.
 
     Closing the iterator early, as an interrupt does, ends the running jobs without a record.
-
-    Parameters
-    ----------
-    requests : sequence of Request
-    settings : EngineSettings
-    at_a_time : int
-        Jobs that run at a time on one machine and share its memory.
-    requested_ns : int or None
-        As in `usable_record`.
+    ``at_a_time`` jobs share one machine and its memory; for ``requested_ns`` see `usable_record`.
 
     Raises
     ------

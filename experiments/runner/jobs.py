@@ -49,15 +49,12 @@ PROCESS, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One composed configuration and its output folder.
+    """One resolved configuration and its output folder.
 
     Attributes
     ----------
-    values : dict
-        The resolved configuration.
     config_hash : str
-        SHA-256 of everything in it that can change the result.
-    folder : Path
+        SHA-256 of everything in the configuration that can change the result.
     publish_as : str or None
         Name of its record in the results; None: do not publish it.
     overrides : tuple of str
@@ -151,18 +148,8 @@ def attempt(
 ) -> Record:
     """Run a job unless it is done; returns its record, of a success or a failure.
 
-    Parameters
-    ----------
-    request : Request
-    run : callable
-        () -> why it wrote no record of the job; None if it did.
-    requested_ns : int, optional
-        As in `usable_record`.
-
-    Raises
-    ------
-    MvestError
-        If nothing can be recorded, or ``run`` raises one.
+    ``run`` returns why it wrote no record of the job, or None; for ``requested_ns`` see
+    `usable_record`. Raises an `MvestError` if nothing can be recorded, or ``run`` raises one.
     """
     folder = request.folder
     require_writable(folder)

@@ -75,15 +75,8 @@ def implausible(record: Record) -> str:
 def settings_of(config: Values, overrides: Iterable[str], factors: Values) -> dict[str, Any]:
     """Overridden settings of a run as they were typed, those of `ALWAYS`, and its factors.
 
-    Parameters
-    ----------
-    config : mapping
-        As written next to the result, with the content of files in place of their names, which
-        must not reach a store.
-    overrides : iterable of str
-        ``NAME=VALUE``.
-    factors : mapping
-        Those of a sweep's job; left out if a setting has the same value.
+    ``config`` is the one next to the result, with the content of files in place of their names,
+    which must not reach a store. A factor is left out if a setting has the same value.
     """
     words = (word.lstrip("+~").partition("=") for word in overrides)
     typed = {name.replace("/", "."): text for name, _, text in words if name != "name"}

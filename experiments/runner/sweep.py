@@ -54,7 +54,6 @@ def launch(
     config : DictConfig
         The sweep's own configuration, with Hydra's part.
     loader : ConfigLoader
-        Hydra's.
     overrides : sequence of sequence of str
         Those of each job.
     first : int

@@ -176,19 +176,7 @@ def _left_out(path: Path, error: Exception) -> int:
 
 
 class Entry(NamedTuple):
-    """A run for MLflow.
-
-    Attributes
-    ----------
-    result : Path
-    name : str
-    tags : mapping
-        The first one identifies the run.
-    settings : mapping
-    numbers : mapping
-        Metrics.
-    seconds : float
-    """
+    """A run for MLflow; its first tag identifies it, ``seconds`` is the time of its computation."""
 
     result: Path
     name: str
@@ -207,7 +195,7 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     jobs: Any = plan["jobs"] if plan else [{"folder": "", "overrides": _typed(folder)}]
     shown = jobs if len(jobs) <= MANY else []
     with (
-        PartBar(f"{name}, to MLflow", len(shown), "run") as bar,
+        PartBar(f"{name}, to MLflow", len(shown), "run", quiet=True) as bar,
         opened(tracking["uri"], outputs, name),
     ):
         known = runs_of(name, "" if plan else f"tags.folder = '{folder.resolve().name}'")

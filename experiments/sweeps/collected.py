@@ -63,8 +63,6 @@ class Sweep(Frozen):
     ----------
     version : int
         Of this layout.
-    name, size, title : str
-    parameters : tuple of str, (p,)
     paper : mapping or None
         The paper's results: ``table``, ``estimate``, ``error_percent``.
     provenance : Provenance

@@ -12,6 +12,12 @@ from tests.experiments.composed_once import composed_once
 
 
 @pytest.fixture(autouse=True)
+def no_heartbeat(monkeypatch):
+    """Lines that are written after ten seconds would depend on how busy the machine is."""
+    monkeypatch.setattr("experiments.common.progress.Heartbeat._beat", lambda self: None)
+
+
+@pytest.fixture(autouse=True)
 def no_hydra_left_over():
     yield
     GlobalHydra.instance().clear()

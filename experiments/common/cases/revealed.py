@@ -71,17 +71,10 @@ def grouped(estimates: Iterable[tuple[str, EstimateRecord, EstimateRecord]]) -> 
 def unknowns_of(
     groups: Groups, *, by_name: bool = False, nuisances: bool = False, stated: bool = True
 ) -> dict[str, list[Unknown]]:
-    """The moduli of each group.
+    """The moduli of each group, with ``nuisances`` all its unknowns.
 
-    Parameters
-    ----------
-    groups : mapping
-    by_name : bool
-        Divide each group into ``GROUP, UNKNOWN``.
-    nuisances : bool
-        Include all other unknowns.
-    stated : bool
-        Leave out numbers whose verdict is that there is no estimate.
+    ``by_name`` divides each group into ``GROUP, UNKNOWN``; ``stated`` leaves out numbers whose
+    verdict is that there is no estimate.
     """
     found: dict[str, list[Unknown]] = {}
     for name, group in groups.items():

@@ -54,20 +54,8 @@ class GitState(Frozen):
 class Provenance(Frozen):
     """Where a record came from.
 
-    Attributes
-    ----------
-    git : GitState
-    versions : mapping
-        Package -> version.
-    threads : mapping
-        Environment variable that caps threads -> its value.
-    python, platform, machine : str
-    cpu_count : int or None
-    config_hash, mesh_hash : str
-        SHA-256; the mesh's is "none" where there is no mesh.
-    seed : int
-    finished : str
-        UTC, ISO 8601.
+    ``threads`` maps environment variables that cap threads to their values. Hashes are SHA-256; the
+    mesh's is "none" without a mesh. ``finished`` is UTC in ISO 8601.
     """
 
     git: GitState
@@ -105,16 +93,8 @@ class Mesh(Frozen):
 class Model(Frozen):
     """The estimator's model, as far as its cost depends on it.
 
-    Attributes
-    ----------
-    element : str
-    cells : tuple of int
-        Around the valve, from annulus to free edge, through the thickness.
-    source : str
-        Of the mesh.
-    filter : str
-    noise_mm : float
-        SD of the errors of an observed coordinate.
+    ``cells`` are counted around the valve, from annulus to free edge, and through the thickness;
+    ``source`` is that of the mesh, ``noise_mm`` the SD of the errors of an observed coordinate.
     """
 
     element: str
@@ -198,7 +178,6 @@ class Record(Result):
         What is varied in this job of a sweep, by name.
     seconds_total : float
         From the start of the job to its record.
-    provenance : Provenance
     """
 
     version: int
@@ -328,20 +307,10 @@ def sealed_record(record: Record, arrays: Path) -> dict[str, Any]:
 
 
 def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None) -> Record:
-    """A record from plain data, which must be unchanged since they were written.
+    """A record from plain data; ``where`` names them in an error.
 
-    Parameters
-    ----------
-    data : mapping
-    where : str
-        Names the data in an error.
-    arrays : Path, optional
-        The file of its arrays, if it has one; None: do not check it.
-
-    Raises
-    ------
-    InputError
-        If the data are no record of this version, or they or the arrays were changed.
+    ``arrays`` is the file of its arrays, if it has one; None: do not check it. Raises an
+    `InputError` if the data are no record of this version, or they or the arrays were changed.
     """
     known = {key: value for key, value in data.items() if key not in ("sha256", ARRAYS)}
     if known.get("version") != VERSION:

@@ -67,31 +67,24 @@ for way in sys.stdin.read().splitlines():
 
 OTHERS = [
     "open(os.path.join('case', 'hidden.json')).read()",
-    # Only begins alike.
-    "open(os.path.join('hidden_from_nobody', 'hidden.json')).read()",
+    "open(os.path.join('hidden_from_nobody', 'hidden.json')).read()",  # only begins alike
     "os.listdir(root)",
     "Path('out.json').write_text('x')",
-    "os.mkdir('more')",
 ]
 WALK = "print(*[name for _, _, names in os.walk(root) for name in names], file=sys.stderr)"
 
 
-@pytest.fixture(scope="module")
-def attempts(tmp_path_factory):
-    """What came of every way in one sealed process, the folder they went for, and the walk's names.
-
-    A process of its own for each would import for seconds.
-    """
-    folder = tmp_path_factory.mktemp("sealed") / "root"
+def test_only_the_sealed_folder_cannot_be_opened_in_any_usual_way(tmp_path):
+    root = tmp_path / "root"
     for name in ("hidden", "case", "hidden_from_nobody"):
-        (folder / name).mkdir(parents=True)
-        (folder / name / "hidden.json").write_text('{"E_f.anterior": 4.321}')
-        (folder / name / "positions.npz").write_bytes(b"")
-    (folder / "door").symlink_to("hidden", target_is_directory=True)
-    (folder / "window.json").symlink_to(Path("hidden") / "hidden.json")
+        (root / name).mkdir(parents=True)
+        (root / name / "hidden.json").write_text('{"E_f.anterior": 4.321}')
+        (root / name / "positions.npz").write_bytes(b"")
+    (root / "door").symlink_to("hidden", target_is_directory=True)
+    (root / "window.json").symlink_to(Path("hidden") / "hidden.json")
     ways = [*WAYS.values(), WALK, *OTHERS]
     finished = subprocess.run(
-        [sys.executable, "-c", ATTEMPT, str(folder)],
+        [sys.executable, "-c", ATTEMPT, str(root)],
         input="\n".join(ways),
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -99,26 +92,11 @@ def attempts(tmp_path_factory):
         check=True,
     )
     outcome = dict(zip(ways, finished.stdout.splitlines(), strict=True))
-    return outcome, folder, finished.stderr.split()
-
-
-def test_a_sealed_folder_cannot_be_opened_in_any_usual_way(attempts):
-    outcome, root, _ = attempts
     assert {way: outcome[code] for way, code in WAYS.items()} == dict.fromkeys(WAYS, "sealed")
-    assert sorted(path.name for path in (root / "hidden").iterdir()) == [
-        "hidden.json", "positions.npz"
-    ]  # fmt: skip
-
-
-def test_all_other_folders_can(attempts):
-    outcome, _, _ = attempts
-    assert {outcome[way] for way in OTHERS} == {"done"}
-
-
-def test_a_walk_does_not_name_what_is_sealed(attempts):
-    outcome, _, names = attempts
-    assert outcome[WALK] == "done"
-    assert names.count("hidden.json") == 2
+    assert {outcome[way] for way in (WALK, *OTHERS)} == {"done"}
+    assert finished.stderr.split().count("hidden.json") == 2, "a walk does not name what is sealed"
+    left = sorted(path.name for path in (root / "hidden").iterdir())
+    assert left == ["hidden.json", "positions.npz"]
 
 
 def a_result():

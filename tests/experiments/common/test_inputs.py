@@ -17,7 +17,6 @@ from experiments.common.schema import Reads, build
 from experiments.common.study import load_study, study_names
 from experiments.run import main
 from experiments.studies.imported import DonorSettings, recorded_valve
-from mvest.cases.folder import write_case
 from mvest.exchange.external.contract import write_points
 from mvest.exchange.volumes import write_sequence_nrrd
 from mvest.imaging.volume import Modality, VolumeSequence
@@ -27,7 +26,6 @@ from tests.exchange.external.programs import SPRINGS, springs
 from tests.exchange.surfaces import recorded
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies import test_imported
-from tests.made_up_closure import made_up_case
 
 
 def marked(cls: type, above: str = "") -> Iterator[str]:
@@ -165,11 +163,6 @@ def typed(monkeypatch, *words: str) -> int:
     return main()
 
 
-def own_case(folder: Path) -> list[str]:
-    write_case(folder / "case", made_up_case(0.3, 8.0, np.random.default_rng(1)))
-    return ["experiment=own_valve", f"case={folder / 'case'}", "personal.mesh.source=structured"]
-
-
 def own_volume(folder: Path) -> list[str]:
     frames = np.random.default_rng(1).integers(0, 255, (4, 20, 20, 20), dtype=np.uint8)
     place = (np.full(3, 3.0), np.eye(3), np.full(3, -30.0))
@@ -190,9 +183,7 @@ def own_program(folder: Path) -> list[str]:
             f"external.command={command}"]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "made", [pytest.param(own_case, marks=pytest.mark.slow), own_volume, own_program]
-)
+@pytest.mark.parametrize("made", [own_volume, own_program])
 def test_nothing_is_read_that_is_not_in_the_hash(given, monkeypatch, made):
     words = made(given)
     with all_digested(given):

@@ -7,12 +7,13 @@ from experiments.common import progress
 from experiments.common.progress import PartBar, SolveBar, wrapped
 from tests.processes import until
 
+BEAT = progress.Heartbeat._beat
+
 
 @pytest.fixture
 def clock(monkeypatch) -> list[float]:
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(progress.Heartbeat, "_beat", lambda self: None)
     return now
 
 
@@ -85,6 +86,7 @@ def test_quick_solves_are_left_to_the_bar(clock, capsys) -> None:
 
 
 def test_silence_is_broken_by_what_goes_on(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(progress.Heartbeat, "_beat", BEAT)
     monkeypatch.setattr(progress, "SILENCE_S", 1.0)
     said: list[str] = []
     monkeypatch.setattr(progress, "say", said.append)
