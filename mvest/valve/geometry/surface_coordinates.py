@@ -47,10 +47,8 @@ class SurfaceCoordinates:
     ----------
     triangles : ndarray
         ``(m, 3)`` vertex indices.
-    theta : ndarray
-        ``(n,)`` rad in [0, 2 pi), angle around the valve.
-    s : ndarray
-        ``(n,)`` from 0 (annulus) to 1 (free edge).
+    theta, s : (n,)
+        Angle around the valve in [0, 2 pi), and 0 (annulus) to 1 (free edge).
     modulus : float
         Length of the strip for a width of 2 pi: ``(theta, modulus * s)`` is near conformal.
     circumferential : ndarray
@@ -163,10 +161,8 @@ def surface_coordinates(
 
     Parameters
     ----------
-    vertices : ndarray
-        ``(n, 3)`` mm.
-    triangles : ndarray
-        ``(m, 3)``.
+    vertices : (n, 3) mm
+    triangles : (m, 3)
     annulus, free_edge : ndarray
         Vertex indices of the two boundary loops, the annulus in loop order.
 
