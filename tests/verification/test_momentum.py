@@ -117,7 +117,7 @@ def reference(mass, start):
 
 
 def test_pendulum_converges_to_the_ode_with_the_first_order():
-    sizes = (150, 300)
+    sizes = (300, 600)
     errors = []
     for n in sizes:
         x, mass, start = pendulum(n)
