@@ -54,8 +54,7 @@ class Element:
         ``(q, 3) -> (q, 3)`` a nearby point of the element; an inner point is returned unchanged.
     face : str
         Name of the face element of the outer faces (the ``zeta`` faces of layered elements).
-    centre : ndarray
-        ``(1, 3)``.
+    centre : (1, 3)
     top_face : ndarray
         Local nodes of the face at ``zeta = 1`` of layered elements; empty for the others.
     """
@@ -88,14 +87,11 @@ class Face:
     ----------
     name : str
     n_nodes : int
-    shape : ndarray
-        ``(q, n_nodes)`` shape functions at the quadrature points.
-    gradient : ndarray
-        ``(q, n_nodes, 2)`` derivatives at the quadrature points.
-    weights : ndarray
-        ``(q,)``.
-    corners : ndarray
-        Local indices of triangles ``(m, 3)`` that cover the face, for drawing.
+    shape, gradient : (q, n_nodes) and (q, n_nodes, 2)
+        Shape functions and their derivatives at the quadrature points.
+    weights : (q,)
+    corners : (m, 3)
+        Local nodes of triangles that cover the face.
     """
 
     name: str

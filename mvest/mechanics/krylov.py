@@ -46,8 +46,7 @@ def gmres(
         ``(n,) -> (n,)``, the matrix times a vector.
     precondition : callable
         ``(p, n) -> (p, n)``, approximate solutions.
-    right : ndarray
-        ``(p, n)``.
+    right : (p, n)
     tolerance : float
         Preconditioned residual over preconditioned right-hand side.
     exact : callable

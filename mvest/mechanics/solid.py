@@ -57,14 +57,13 @@ class SolidState:
 
     Attributes
     ----------
-    green : ndarray
-        ``(e, q, 6)`` Green-Lagrange strain, enhanced part included.
-    stress, tangent : ndarray
-        ``(e, q, 6)`` and ``(e, q, 6, 6)`` MPa.
-    alpha : ndarray
-        ``(e, n_modes)`` enhanced parameters.
-    deformation : ndarray
-        ``(e, q, 3, 3)`` F in the fibre frame.
+    green : (e, q, 6)
+        Green-Lagrange strain, enhanced part included.
+    stress, tangent : (e, q, 6) and (e, q, 6, 6) MPa
+    alpha : (e, n_modes)
+        Enhanced parameters.
+    deformation : (e, q, 3, 3)
+        F in the fibre frame.
     """
 
     green: FloatArray

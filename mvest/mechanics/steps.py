@@ -112,12 +112,9 @@ class Simulation:
 
     Attributes
     ----------
-    times : ndarray
-        ``(f,)`` s of the completed steps, the initial state first.
-    frames : ndarray
-        ``(f, n, 3)`` mm nodal positions.
-    sensitivities : ndarray
-        ``(f, p, n, 3)`` mm per unit of each parameter.
+    times : (f,) s
+        Of the completed steps, the initial state first.
+    frames, sensitivities : (f, n, 3) mm and (f, p, n, 3) mm per unit of each parameter
     reason : StepReason
     records : tuple of StepRecord
     solver : str

@@ -46,16 +46,12 @@ class Loads:
     ----------
     pressure : float
         MPa.
-    tips : ndarray
-        ``(n_tips, 3)`` mm papillary tips.
-    hinge : ndarray
-        ``(h, 3)`` mm targets of the hinge points.
-    fixed : ndarray
-        ``(n_fixed, 3)`` mm positions of the fixed nodes.
-    body_force : ndarray or None
-        ``(n, 3)`` N dead nodal forces.
-    tie_lengths : ndarray or None
-        ``(k,)`` mm force-free lengths of the ties; None without ties.
+    tips, hinge, fixed : (n_tips, 3), (h, 3) and (n_fixed, 3) mm
+        Papillary tips, targets of the hinge points, and fixed nodes.
+    body_force : (n, 3) N or None
+        Dead nodal forces.
+    tie_lengths : (k,) mm or None
+        Force-free lengths of the ties.
     """
 
     pressure: float = 0.0

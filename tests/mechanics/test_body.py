@@ -68,21 +68,6 @@ def test_two_materials_and_their_parameters():
     assert np.all(result.sensitivities[-1, :, :, 2].sum(axis=1) < 0)
 
 
-def test_forces_as_numbers_and_as_a_function_agree_and_are_borne_by_what_is_held():
-    given = arguments() | {"pressure_faces": None, "static": True, "times": [1.0]}
-    push = np.zeros_like(given["nodes"])
-    push[np.all(np.abs(given["nodes"] - [4.5, 4.5, 1.0]) < 0.1, axis=1)] = (0.01, 0.02, 0.05)
-    assert np.count_nonzero(push) == 3
-    number = simulate_body(**given, forces=push).frames
-    function = simulate_body(**given, forces=lambda t: t * push).frames
-    np.testing.assert_allclose(number[-1], function[-1], atol=1e-9)
-    assert number[-1, :, 2].max() > 1.1
-    # Twice the force in two steps, the first of which is the one above.
-    twice = simulate_body(**given | {"times": [1.0, 2.0]}, forces=lambda t: t * push).frames
-    np.testing.assert_allclose(twice[1], number[-1], atol=1e-9)
-    assert twice[2, :, 2].max() > number[-1, :, 2].max()
-
-
 @pytest.mark.parametrize("static", [True, False])
 def test_half_a_sheet_with_a_plane_of_symmetry_does_what_the_whole_does(static):
     # Pressed and pulled symmetrically; the plane x = 4.5 keeps its first coordinate only.

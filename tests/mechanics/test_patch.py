@@ -66,7 +66,7 @@ def test_rigid_rotation_gives_no_force(element_type):
     assert np.abs(solid.forces(state)).max() < 1e-13 * solid.law.stiffness.max()
 
 
-@pytest.mark.parametrize("element_type", ELEMENT_NAMES)
+@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
 def test_rigid_rotation_of_a_deformed_body_turns_its_forces(element_type):
     # Objectivity: f(R x) = R f(x).
     mesh = block(element_type, fibre=(0.8, 0.6, 0))

@@ -35,7 +35,7 @@ def tangent():
 
 
 @pytest.mark.parametrize("name", available())
-@pytest.mark.parametrize("columns", [None, 1, 2, 4])
+@pytest.mark.parametrize("columns", [None, 4])
 def test_solutions_solve(tangent, name, columns):
     matrix, right = tangent
     right = right[:, 0] if columns is None else right[:, :columns]

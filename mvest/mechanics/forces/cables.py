@@ -114,10 +114,8 @@ class Cables:
         -------
         internal_force : ndarray
             ``(c, 3)`` N, derivative of the cable energy by the end position.
-        stiffness : ndarray
-            ``(c, 3, 3)`` N/mm.
-        by_stiffness_factor, by_length_factor : ndarray
-            ``(c, 3)`` N.
+        stiffness : (c, 3, 3) N/mm
+        by_stiffness_factor, by_length_factor : (c, 3) N
         """
         arm = self.patches(x) - tips[self.tip]
         span = np.linalg.norm(arm, axis=1)
@@ -148,8 +146,7 @@ class Hinge:
     ----------
     points : Embedding
         ``(h,)``.
-    stiffness : ndarray
-        ``(h,)`` N/mm.
+    stiffness : (h,) N/mm
     """
 
     points: Embedding
@@ -231,8 +228,7 @@ class Ties:
 
         Parameters
         ----------
-        x : ndarray
-            ``(n, 3)`` mm.
+        x : (n, 3) mm
         length : ndarray
             ``(k,)`` mm, force-free lengths.
 
@@ -240,8 +236,7 @@ class Ties:
         -------
         force : ndarray
             ``(k, 3)`` N; the second point gets the opposite.
-        stiffness : ndarray
-            ``(k, 3, 3)`` N/mm.
+        stiffness : (k, 3, 3) N/mm
         """
         d = self.spans(x)
         span = np.maximum(np.linalg.norm(d, axis=1), 1e-12)

@@ -39,12 +39,11 @@ class Sheet(NamedTuple):
 
     Attributes
     ----------
-    rest : ndarray
-        ``(k, 3)`` mm, the points at rest.
-    areas, thickness : ndarray
-        ``(k,)`` mm^2 and mm.
-    host, by_host : ndarray
-        ``(k,)`` host element of each point, and the points sorted by their hosts.
+    rest : (k, 3) mm
+        The points at rest.
+    areas, thickness : (k,) mm² and mm
+    host, by_host : (k,)
+        Host element of each point, and the points sorted by their hosts.
     activation, distance : float
         Activation and reference distance over the thickness.
     pressure : float
@@ -66,16 +65,14 @@ class ContactPairs(NamedTuple):
 
     Attributes
     ----------
-    first, second : ndarray
-        ``(p,)`` points, with ``host[first] <= host[second]``.
-    reach, reference : ndarray
-        ``(p,)`` activation and reference distance of each pair, mm.
-    start : ndarray
-        ``(g + 1,)`` start of each group of equal hosts.
-    hosts : ndarray
-        ``(g, 2)``.
-    positions : ndarray
-        ``(k, 3)`` positions of the points at the search.
+    first, second : (p,)
+        Points with ``host[first] <= host[second]``.
+    reach, reference : (p,) mm
+        Activation and reference distance.
+    start, hosts : (g + 1,) and (g, 2)
+        Start of each group of pairs with equal hosts, and these hosts.
+    positions : (k, 3) mm
+        Positions of the points at the search.
     """
 
     first: NDArray[np.int32]

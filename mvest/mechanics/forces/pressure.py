@@ -65,8 +65,7 @@ class PressureLoad:
 
         Parameters
         ----------
-        x : ndarray
-            ``(n, 3)`` mm.
+        x : (n, 3) mm
         factor : float
             MPa.
         positions, skew : ndarray

@@ -64,8 +64,7 @@ class BiotLaw:
 
     Attributes
     ----------
-    stiffness : ndarray
-        ``(n_regions, 6, 6)`` MPa.
+    stiffness : (n_regions, 6, 6) MPa
     corotational : bool
         Whether strain and stress are the linear ones in the rotated frame of the element
         (:class:`mvest.mechanics.solid.EdgeRotations`).

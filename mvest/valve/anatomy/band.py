@@ -174,8 +174,7 @@ class Band:
 
         Parameters
         ----------
-        phi : ndarray
-            ``(k,)`` degrees.
+        phi : (k,) degrees
         annulus : ndarray
             ``(a, 3)`` mm, of the vertices ``valve.annulus``.
         """

@@ -124,8 +124,7 @@ class LeafletSurface:
 
     Attributes
     ----------
-    vertices : ndarray
-        ``(n, 3)`` mm.
+    vertices : (n, 3) mm
     triangles : ndarray
         ``(m, 3)``; their normals point to the ventricle.
     region : ndarray
@@ -198,8 +197,7 @@ class Chordae:
     family : ndarray
         ``(c,)`` index into ``family_names`` (marginal, basal, ...).
     family_names : tuple of str
-    rest_length : ndarray
-        ``(c,)`` mm.
+    rest_length : (c,) mm
     axial_stiffness : ndarray
         ``(c,)`` N, Young's modulus times cross section.
     toe_strain : float
@@ -245,8 +243,7 @@ class Motion:
         defines the phase as a function of time.
     annulus : ndarray
         ``(f, n_annulus, 3)`` mm; entry 0 equals the reference positions.
-    papillary_tips : ndarray
-        ``(f, n_tips, 3)`` mm.
+    papillary_tips : (f, n_tips, 3) mm
     """
 
     phase: FloatArray

@@ -133,8 +133,7 @@ def fields_of_masks(
     ----------
     masks
         ``(I, J, K)`` each: voxels of the anterior and of the posterior leaflet, or of both.
-    spacing
-        ``(3,)`` mm.
+    spacing : (3,) mm
     blur
         Standard deviation of the smoothing, in voxels.
     step_mm

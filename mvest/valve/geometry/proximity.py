@@ -112,14 +112,8 @@ def _closest_of_candidates(
 class ClosestPoints:
     """Closest points of a triangulated surface to some points.
 
-    Attributes
-    ----------
-    distance
-        ``(n,)`` mm, unsigned.
-    triangle
-        ``(n,)`` number of the triangle holding the closest point.
-    barycentric
-        ``(n, 3)`` coordinates of the closest point in that triangle.
+    ``distance (n,)`` mm, ``triangle (n,)`` that holds each closest point, and its ``barycentric
+    (n, 3)`` coordinates there.
     """
 
     distance: FloatArray
@@ -141,8 +135,7 @@ def closest_points(points: FloatArray, vertices: FloatArray, triangles: IntArray
 
     Parameters
     ----------
-    points
-        ``(n, 3)`` mm.
+    points : (n, 3) mm
     vertices, triangles
         The surface, ``(n_vertices, 3)`` mm and ``(m, 3)``.
 

@@ -52,8 +52,7 @@ def masks_midsurface(
         ``(I, J, K)`` each: both leaflets together, or the anterior and the posterior one.
     grid
         Spacing ``(3,)`` mm, direction ``(3, 3)`` (columns along i, j and k) and origin ``(3,)`` mm.
-    tips
-        ``(2, 3)`` mm.
+    tips : (2, 3) mm
     seams, blur
         See `thick_leaflets` and `fields_of_masks`.
     known

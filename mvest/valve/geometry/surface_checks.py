@@ -42,8 +42,7 @@ def check_surface(
 
     Parameters
     ----------
-    vertices
-        ``(n, 3)`` mm.
+    vertices : (n, 3) mm
     triangles
         ``(m, 3)`` vertex numbers.
     closed

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
@@ -47,10 +48,8 @@ class SurfaceCoordinates:
     ----------
     triangles : ndarray
         ``(m, 3)`` vertex indices.
-    theta : ndarray
-        ``(n,)`` rad in [0, 2 pi), angle around the valve.
-    s : ndarray
-        ``(n,)`` from 0 (annulus) to 1 (free edge).
+    theta, s : (n,)
+        Angle around the valve in [0, 2 pi), and 0 (annulus) to 1 (free edge).
     modulus : float
         Length of the strip for a width of 2 pi: ``(theta, modulus * s)`` is near conformal.
     circumferential : ndarray
@@ -84,19 +83,8 @@ class SurfaceCoordinates:
 
         A point slightly outside the polygonal edge is moved to the nearest triangle.
         """
-        corners, turn = self.strip_triangles(), np.array([2 * np.pi, 0.0])
-        strip = np.concatenate([corners - turn, corners, corners + turn]).reshape(-1, 2)
         points = np.column_stack([theta, self.modulus * np.asarray(s, dtype=float)])
-        flat = ((0, 0), (0, 1))  # with z = 0
-        found = closest_points(
-            np.pad(points, flat), np.pad(strip, flat), np.arange(len(strip)).reshape(-1, 3)
-        )
-        outside = found.distance > OUTSIDE * 2 * np.pi
-        if outside.any():
-            raise InputError(
-                f"{outside.sum()} points lie outside the surface (coordinate s must be in [0, 1])"
-            )
-        return found.triangle % len(corners), found.barycentric
+        return _locate_in_plane(self.strip_triangles(), points, period=2 * np.pi)
 
 
 def boundary_loops(triangles: IntArray) -> list[IntArray]:
@@ -163,10 +151,8 @@ def surface_coordinates(
 
     Parameters
     ----------
-    vertices : ndarray
-        ``(n, 3)`` mm.
-    triangles : ndarray
-        ``(m, 3)``.
+    vertices : (n, 3) mm
+    triangles : (m, 3)
     annulus, free_edge : ndarray
         Vertex indices of the two boundary loops, the annulus in loop order.
 
@@ -330,6 +316,49 @@ def _perpendicular_to_gradient(
     n = vertex_normals(vertices, triangles)
     direction -= n * np.einsum("ij,ij->i", direction, n)[:, None]
     return unit_rows(direction)
+
+
+def _locate_in_plane(
+    corners: FloatArray, points: FloatArray, period: float
+) -> tuple[IntArray, FloatArray]:
+    """Triangle ``(n,)`` and weights ``(n, 3)`` of points in a periodic strip.
+
+    One of the dozen nearest triangles nearly always holds the point; otherwise all are searched.
+    """
+    m, shift = len(corners), np.array([period, 0.0])
+    repeated = np.concatenate([corners - shift, corners, corners + shift])
+    triangle = np.zeros(len(points), dtype=np.int64)
+    weights = np.zeros((len(points), 3))
+    best = np.full(len(points), -np.inf)
+    _, candidates = cKDTree(repeated.mean(axis=1)).query(points, k=min(12, 3 * m))
+    for column in np.atleast_2d(candidates).T:
+        w = _barycentric(repeated[column], points)
+        worst = w.min(axis=1)
+        better = worst > best
+        best[better], triangle[better], weights[better] = worst[better], column[better], w[better]
+    todo = np.flatnonzero(best < -1e-9)
+    if todo.size:
+        flat = np.pad(repeated.reshape(-1, 2), ((0, 0), (0, 1)))
+        found = closest_points(
+            np.pad(points[todo], ((0, 0), (0, 1))), flat, np.arange(9 * m).reshape(-1, 3)
+        )
+        if np.any(found.distance > OUTSIDE * period):
+            raise InputError(
+                f"{np.sum(found.distance > OUTSIDE * period)} points lie outside the surface "
+                "(coordinate s must be in [0, 1])"
+            )
+        triangle[todo], weights[todo] = found.triangle, found.barycentric
+    weights = np.maximum(weights, 0.0)
+    return triangle % m, weights / weights.sum(axis=1, keepdims=True)
+
+
+def _barycentric(corner: FloatArray, point: FloatArray) -> FloatArray:
+    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    r = point - corner[:, 0]
+    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    u = (r[:, 0] * b[:, 1] - r[:, 1] * b[:, 0]) / area
+    v = (a[:, 0] * r[:, 1] - a[:, 1] * r[:, 0]) / area
+    return np.column_stack([1 - u - v, u, v])
 
 
 def _signed_area(corner: FloatArray) -> FloatArray:

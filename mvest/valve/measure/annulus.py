@@ -18,14 +18,10 @@ class AnnulusPlane:
 
     Attributes
     ----------
-    origin
-        ``(3,)`` mm, centroid of the annulus curve (weighted by length).
-    normal
-        ``(3,)`` unit, points from the atrium to the ventricle.
-    anterior
-        ``(3,)`` unit, in the plane, points from the posterior to the anterior side.
-    lateral
-        ``(3,)`` unit, ``normal × anterior``, along the commissures.
+    origin : (3,) mm
+        Centroid of the annulus curve, weighted by length.
+    normal, anterior, lateral : (3,) unit
+        From atrium to ventricle; in the plane from posterior to anterior; ``normal × anterior``.
     """
 
     origin: FloatArray
@@ -102,18 +98,8 @@ def annulus_plane(
 class AnnulusMeasurements:
     """Size of an annulus (mm, mm²).
 
-    Attributes
-    ----------
-    anteroposterior_diameter
-        Extent along the anterior direction of the chord through the centre, mm.
-    commissural_diameter
-        Extent along the lateral direction of the chord through the centre, mm.
-    height
-        Extent along the normal (saddle height), mm.
-    circumference
-        Length of the curve in space, mm.
-    projected_area
-        Area within its projection on the plane, mm².
+    Diameters are chords through the centre along the anterior and the lateral direction, the height
+    is the extent along the normal, and the area that of the projection on the plane.
     """
 
     anteroposterior_diameter: float

@@ -32,13 +32,12 @@ class LeafletProjection:
 
     Attributes
     ----------
-    anterior, lateral
-        ``(rows,)`` and ``(columns,)`` mm, pixel centres along those two directions.
-    inside
-        ``(rows, columns)`` pixels inside the projected annulus.
-    depth
-        ``(rows, columns)`` mm below the annulus plane of the first leaflet surface seen from the
-        atrium; infinite where the view is open.
+    anterior, lateral : (rows,) and (columns,) mm
+        Pixel centres along those directions.
+    inside : (rows, columns)
+        Pixels inside the projected annulus.
+    depth : (rows, columns) mm
+        Depth of the first leaflet surface below the annulus plane, infinite if there is none.
     """
 
     anterior: FloatArray
@@ -195,8 +194,7 @@ def coaptation_length(
 
     Parameters
     ----------
-    vertices
-        ``(n, 3)`` mm.
+    vertices : (n, 3) mm
     first, second
         ``(m1, 3)`` and ``(m2, 3)`` triangles of the two leaflets, oriented alike (both towards
         the ventricle).
@@ -267,14 +265,12 @@ class Gap:
 
     Attributes
     ----------
-    anterior, lateral : ndarray
-        ``(rows,)`` and ``(columns,)`` mm, pixel centres along those directions of the annulus.
-    open : ndarray
-        ``(rows, columns)`` pixels of the gap.
-    slit : ndarray
-        ``(rows, columns)`` other pixels within the annulus that no midsurface covers.
-    level : ndarray
-        ``(rows, columns)`` mm below the annulus plane of the nearest midsurface.
+    anterior, lateral : (rows,) and (columns,) mm
+        Pixel centres along those directions of the annulus.
+    open, slit : (rows, columns)
+        Pixels of the gap, and other pixels within the annulus that no midsurface covers.
+    level : (rows, columns) mm
+        Depth of the nearest midsurface below the annulus plane.
     resolution : float
         mm.
     """

@@ -178,8 +178,8 @@ def layered_wedges(
     near = sp.csr_matrix(near + near.T)
     degree = np.asarray(near.sum(axis=1)).ravel()
     for _ in range(SMOOTHING):
-        normals = unit_rows(normals + (near @ normals) / degree[:, None])
-        thickness = 0.5 * (thickness + (near @ thickness) / degree)
+        normals = unit_rows(normals + np.asarray(near @ normals) / degree[:, None])
+        thickness = 0.5 * (thickness + np.asarray(near @ thickness) / degree)
     fibre = unit_rows(fibre - normals * np.sum(fibre * normals, axis=1, keepdims=True))
     per_layer = LEVELS_PER_LAYER[element_type]
     levels = layers * per_layer + 1

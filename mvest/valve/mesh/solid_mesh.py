@@ -36,8 +36,7 @@ class SolidMesh:
 
     Attributes
     ----------
-    nodes : ndarray
-        ``(n, 3)`` mm.
+    nodes : (n, 3) mm
     elements : ndarray
         ``(m, k)`` in the node order of :mod:`mvest.elements`.
     element_type : str
