@@ -177,7 +177,7 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
             if not frames and (tissue.nameless or (anterior is None and len(tissue.masks) < 2)):
                 exchanged = _posterior_first(surface, tissue.nameless, derived)
             surface = surface.exchanged() if exchanged and tissue.nameless else surface
-            check_tips_of(surface, tips, handedness=False)  # `case_of_frames` checks the sides
+            check_tips_of(surface, tips)
             surface = _thick(surface, options, derived)
             surface, done = without_crossings(
                 surface, options.smoothing_mm, thickened=one.role is Role.REFERENCE

@@ -172,22 +172,19 @@ def papillary_tip(muscle: FloatArray, leaflets: FloatArray) -> FloatArray:
     return np.asarray(muscle[along >= along.max() - HEAD_MM].mean(axis=0))
 
 
-def check_tips_of(surface: Midsurface, tips: FloatArray, *, handedness: bool = True) -> None:
-    """Raise if tips and leaflets have different axes, or the valve is a mirror image.
+def check_tips_of(surface: Midsurface, tips: FloatArray) -> None:
+    """Raise if tips and leaflets have different axes.
 
     Parameters
     ----------
     surface
     tips
         ``(2, 3)`` mm, LPS, the antero-lateral one first.
-    handedness
-        Whether to refuse a mirror image.
 
     Raises
     ------
     GeometryError
-        The antero-lateral tip is not on the left of the anterior leaflet seen from the atrium, or a
-        tip is farther than `MAX_AWAY` from the leaflets.
+        A tip is farther than `MAX_AWAY` from the leaflets.
     """
     centre = surface.vertices.mean(axis=0)
     away, turned = (
@@ -198,20 +195,4 @@ def check_tips_of(surface: Midsurface, tips: FloatArray, *, handedness: bool = T
         raise GeometryError(
             f"tips: {away:.0f} mm from the leaflets, expected at most {MAX_AWAY:g} mm"
             + (hint if turned < MAX_AWAY else "")
-        )
-    halves = [
-        surface.vertices[surface.triangles[surface.region == k]].mean(axis=(0, 1)) for k in (0, 1)
-    ]
-    sides = np.stack([tips[0] - tips[1], halves[0] - halves[1], tips.mean(axis=0) - centre])
-    if handedness and np.linalg.det(sides) < 0:
-        exchanged = surface.heights[1] > TALLER * surface.heights[0]
-        raise GeometryError(
-            "seen from the atrium the first tip, the antero-lateral one, is on the right of the "
-            "anterior leaflet, as in a mirror: "
-            + (
-                "exchange the leaflets, the posterior one is the taller one"
-                if exchanged
-                else "give the antero-lateral tip first, if no axis is turned"
-            )
-            + " (mirrored=true takes it as it is)"
         )
