@@ -56,7 +56,7 @@ def test_the_verdict_comes_first_and_then_what_it_fails_by():
     )
     jumping = Path("E_f", (), 3, "a jump of 0.3 mm")
     paths = (jumping, Path("E_f.anterior", (), 3, ""))
-    first, *others = gate_lines(GateReport(rows, paths, None, False))
+    first, *others = gate_lines(GateReport(rows, paths))
     assert "gate NOT passed" in first
     assert "2 variations, 0.7 mm at most" in first
     assert len(others) == 3
