@@ -64,6 +64,6 @@ def test_the_verdict_comes_first_and_then_what_it_fails_by():
     assert "it buckled" in others[0]
     assert "0.7 mm off" in others[1]
     assert "along E_f: a jump of 0.3 mm" in others[2]
-    calm = gate_lines(GateReport(rows[:1], paths[1:], None, True))
+    calm = gate_lines(GateReport(rows[:1], paths[1:]))
     assert len(calm) == 1
     assert "gate passed" in calm[0]
