@@ -159,6 +159,7 @@ def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
         guide=fresh.guide if case.guided else None,
         continuation=case.start != 1,
         reach=np.inf,
+        rounded_start=False,
         perturbation=_perturbation(model.mesh, case.perturbed) if case.perturbed else None,
     )
 
