@@ -264,7 +264,7 @@ class ClosureModel:
         return result
 
     def _close_rounded(self, m: FloatArray) -> bool:
-        """Close the valve at rounded parameters if no closed state is near; whether that is so."""
+        """Close the valve at rounded parameters if no closed state is near; True if it closes."""
         steady = self.continuation and self.settings.protocol.equilibrium
         if not (self.rounded_start and steady) or self._near(m):
             return False
