@@ -248,7 +248,7 @@ def test_a_rounded_start_depends_on_the_parameters_alone():
             assert len(simulation.times) == 2
         ends.append(simulation.frames)
     np.testing.assert_array_equal(*ends)
-    # It starts from the state at (e^1.6, e^1.2) = (4.95, 3.32) and ends in that from the open valve.
+    # It starts at (e^1.6, e^1.2) = (4.95, 3.32) and ends in the state from the open valve.
     for end, m in zip(ends[0], (np.exp([1.6, 1.2]), ways[0][0]), strict=True):
         plain = model_of(GENTLE, **TINY).close(m).simulation
         np.testing.assert_allclose(end, plain.frames[-1], rtol=0, atol=1e-9)
