@@ -19,6 +19,10 @@ STIFFENED = 0.5
 nearly exponential tissue, and a leaflet moves no farther in a step than with its modulus."""
 
 
+SPACING = 0.4
+"""Spacing of the lattice of starting points, in the coordinates of the parameters."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosedState:
     """A closed valve from which further closures may be continued.
@@ -82,6 +86,10 @@ class Coordinates:
         """Parameters ``(p,)`` with the coordinates ``at (p,)``."""
         own, positive = at / self.units, ~np.isnan(self.offsets)
         return np.where(positive, np.exp(np.where(positive, own, 0.0)) - self.offsets, own)
+
+    def rounded(self, m: FloatArray) -> FloatArray:
+        """Parameters ``(p,)`` at the nearest point of a lattice."""
+        return self.parameters(np.round(self(m) / SPACING) * SPACING)
 
     def distance(self, start: FloatArray, end: FloatArray) -> float:
         """Largest change of a coordinate between two parameter sets; infinite if undefined."""

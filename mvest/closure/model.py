@@ -12,7 +12,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from mvest.closure.continuation import ClosedState, Coordinates
+from mvest.closure.continuation import SPACING, ClosedState, Coordinates
 from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.cables import TiedPoints
@@ -97,6 +97,10 @@ class ClosureModel:
     largest_change : float
         Largest change of a coordinate between continued equilibria. A more distant state is
         reached through others: Newton's method does not find equilibria millimetres away.
+    rounded_start : bool
+        Whether a continued valve without a near closed state is closed first at rounded parameters
+        (:meth:`mvest.closure.continuation.Coordinates.rounded`). All estimates of a valve with
+        similar starting values then begin from the same closed state.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
     ties : TiedPoints, optional
@@ -116,6 +120,7 @@ class ClosureModel:
     guide: ClosureModel | None = None
     repeat: bool = True
     largest_change: float = np.inf
+    rounded_start: bool = False
     on_step: Callable[[float, int], None] | None = None
     ties: TiedPoints | None = None
     perturbation: FloatArray | None = None
@@ -241,6 +246,7 @@ class ClosureModel:
         """
         if every_frame:
             return self._close(m, sensitivities, every_frame=True)
+        rounded = self._close_rounded(m)
         stiffens = np.array([name.startswith("stiffening.") for name in self.names], dtype=bool)
         continued = self.continuation and self.settings.protocol.equilibrium
         if continued and np.any(m[stiffens] > 0.0) and not self._near(m):
@@ -249,8 +255,30 @@ class ClosureModel:
         for between in self._way_to(m):
             result = self._close(between)
             if not result.simulation.converged:
-                return result
-        return self._close(m, sensitivities)
+                break
+        else:
+            result = self._close(m, sensitivities)
+        if rounded and not result.simulation.converged:
+            self.restart(None)
+            result = self._close(m, sensitivities)
+        return result
+
+    def _close_rounded(self, m: FloatArray) -> bool:
+        """Close the valve at rounded parameters if no closed state is near; True if it closes."""
+        steady = self.continuation and self.settings.protocol.equilibrium
+        if not (self.rounded_start and steady) or self._near(m):
+            return False
+        self.tuned(m)  # refuses inadmissible parameters before anything is closed
+        at = self._coordinates.rounded(m)
+        if not self._coordinates.distance(at, m) <= min(self.reach, SPACING):
+            return False
+        self.restart(None)
+        try:
+            closes = self._close(at).simulation.converged
+        except MaterialError:
+            closes = False
+        self.restart(self._closed if closes else None)
+        return closes
 
     def _close(
         self, m: FloatArray, sensitivities: bool = True, *, every_frame: bool = False

@@ -232,7 +232,8 @@ class RestGeometry:
         same = model.contact_valve is model.valve
         valve = contact if same else moved(model.valve, model.observed(nodes), thickness, 0.0)
         guide = None if model.guide is None else RestGeometry(model.guide).displaced(parts)
-        return replace(model, valve=valve, contact_valve=contact, mesh=mesh, guide=guide)
+        model = replace(model, mesh=mesh, guide=guide, rounded_start=False)
+        return replace(model, valve=valve, contact_valve=contact)
 
     def change(
         self,

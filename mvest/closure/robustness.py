@@ -131,7 +131,7 @@ class GateReport:
     @property
     def passed(self) -> bool:
         """The verdict."""
-        return all(one.passed for one in (*self.rows, *self.paths))
+        return all(row.passed for row in self.rows) and all(path.passed for path in self.paths)
 
 
 def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
@@ -159,6 +159,7 @@ def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
         guide=fresh.guide if case.guided else None,
         continuation=case.start != 1,
         reach=np.inf,
+        rounded_start=False,
         perturbation=_perturbation(model.mesh, case.perturbed) if case.perturbed else None,
     )
 
@@ -213,7 +214,9 @@ def run_gate(
         rows.append(GateRow(case.name, mean, largest, passed, prediction.reason))
         on_case(rows[-1])
     moduli = np.flatnonzero(is_modulus).tolist()
-    directions = [("E_f", is_modulus.astype(np.float64), COMMON)] if moduli else []
+    directions: list[tuple[str, FloatArray, tuple[float, ...]]] = []
+    if moduli:
+        directions.append(("E_f", is_modulus.astype(np.float64), COMMON))
     if len(moduli) > 1:
         directions += [(model.names[k], np.eye(len(m))[k], SINGLE) for k in moduli]
     paths = []

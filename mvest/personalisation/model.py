@@ -73,9 +73,9 @@ def build_model(
     coarse = build_coarse(case, settings, store)
     shape = GivenValve(case.valve)
     if shape.band is None:
-        return coarse
+        return replace(coarse, rounded_start=True)
     solid = _solid(shape, settings.mesh, store)
-    return replace(coarse, mesh=solid, guide=coarse)
+    return replace(coarse, mesh=solid, guide=coarse, rounded_start=True)
 
 
 def build_coarse(

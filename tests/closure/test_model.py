@@ -236,6 +236,24 @@ def test_a_closure_is_continued_within_reach_only(reach, m, frames):
     assert len(model.close(m, sensitivities=False).simulation.times) == frames
 
 
+def test_a_rounded_start_depends_on_the_parameters_alone():
+    # Rounded in steps of 0.4 in the logarithm; log(9 / 5.5) = 0.49 is beyond the reach.
+    ways = ((np.array([5.5, 3.6]),), (np.array([9.0, 3.6]), np.array([5.5, 3.6])))
+    ends = []
+    for way in ways:
+        model = model_of(GENTLE, **TINY, continuation=True, rounded_start=True, reach=0.3)
+        for m in way:
+            simulation = model.close(m).simulation
+            # From the rounded parameters straight to the equilibrium.
+            assert len(simulation.times) == 2
+        ends.append(simulation.frames)
+    np.testing.assert_array_equal(*ends)
+    # It starts at (e^1.6, e^1.2) = (4.95, 3.32) and ends in the state from the open valve.
+    for end, m in zip(ends[0], (np.exp([1.6, 1.2]), ways[0][0]), strict=True):
+        plain = model_of(GENTLE, **TINY).close(m).simulation
+        np.testing.assert_allclose(end, plain.frames[-1], rtol=0, atol=1e-9)
+
+
 def test_one_model_after_another_leaves_nothing_behind():
     # Retuned models keep their system; each value must come from its own arguments.
     names = (*MODULI, "pressure_scale", "chord_stiffness", "chord_rest_length")

@@ -39,7 +39,7 @@ def test_the_verdict_comes_first_and_then_the_failures():
         GateRow("ramp / 3", 0.04, 0.7, False, "converged"),
     )
     paths = (Path("E_f", (), 3, "a jump of 0.3 mm"), Path("E_f.anterior", (), 3, ""))
-    lines = gate_lines(GateReport(rows, paths, None, False))
+    lines = gate_lines(GateReport(rows, paths))
     words = (
         ("gate NOT passed", "2 variations, 0.7 mm at most"),
         ("time step / 2", "it buckled"),
@@ -48,5 +48,5 @@ def test_the_verdict_comes_first_and_then_the_failures():
     )
     for line, expected in zip(lines, words, strict=True):
         assert all(word in line for word in expected)
-    (calm,) = gate_lines(GateReport(rows[:1], paths[1:], None, True))
+    (calm,) = gate_lines(GateReport(rows[:1], paths[1:]))
     assert "gate passed" in calm

@@ -203,6 +203,7 @@ def build_twin(config: Values) -> Twin:
     )
     if config["guided"]:
         model.guide = guide_of(model, anatomy, config["mesh"])
+        model.rounded_start = True
 
     truth_model, source = build_truth(config, plain, true_settings, anatomy)
     for own, point in ((model, prior.mean), (model, values), (truth_model, values)):

@@ -124,7 +124,7 @@ def gate_of_made_up(values):
     """What the gate would say; asking it is `tests.closure.test_robustness`'s."""
     rows = [GateRow("reference", 0.0, 0.0, True, "converged")]
     rows += [GateRow("perturbed start", 0.1, 0.7, False, "converged")]
-    return GateReport(tuple(rows), (), None, False)
+    return GateReport(tuple(rows))
 
 
 def twin_of_made_up(values, name, changes):
