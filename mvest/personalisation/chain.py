@@ -47,7 +47,7 @@ def personalise(
     settings : PersonaliseSettings, optional
         Default: `default_settings`.
     store : Path, optional
-        Cache of unstructured meshes and closed states.
+        Cache of unstructured meshes.
     on_step : callable, optional
         Progress, see :class:`mvest.closure.model.ClosureModel`.
     on_iterate : callable, optional
