@@ -73,11 +73,6 @@ def test_a_file_is_on_the_disk_before_it_takes_its_name_where_that_is_asked_for(
     assert synced == [False]
 
 
-def test_what_cannot_be_written_is_one_line_of_the_family(tmp_path):
-    with pytest.raises(InputError, match=r"^cannot write .*absent.a: No such .*must exist"):
-        write_atomically(tmp_path / "absent" / "a", "")
-
-
 def test_leftovers_are_taken_away_and_nothing_else(tmp_path):
     for name in ("a.npz", ".part-01-a.npz", ".part-02-b.npz", ".part-03-aa.npz", ".lock"):
         (tmp_path / name).touch()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
+from mvest.estimation import Gaussian, IteratedFilter, Log
 from mvest.exchange.external.contract import Command, RunRequest, read_answer, write_request
 from mvest.exchange.external.model import Differences, ProcessModel
 from tests.places import ROOT
@@ -89,17 +89,6 @@ def test_each_model_estimates_from_the_other_s_data():
         assert found.converged
         # Noise of 1e-4 mm against a prior of 3 MPa: nothing but the data counts.
         np.testing.assert_allclose(found.mean, M, rtol=1e-5)
-
-
-@pytest.mark.parametrize("model", [OwnSheet, SecondSheet])
-def test_inadmissible_moduli_are_a_reason(model):
-    for values in ([-1.0, 1.0], [0.0, 1.0], [np.inf, 1.0]):
-        prediction = model(TINY)(np.array(values))
-        assert not prediction.converged
-        assert "expected positive moduli" in prediction.reason
-    prior = Gaussian(np.array([-1.0, 1.5]), np.eye(2))
-    found = IteratedFilter()(model(TINY), prior, TINY.points.ravel(), 1.0)
-    assert found.reason is Reason.MODEL_FAILED
 
 
 @pytest.mark.parametrize(

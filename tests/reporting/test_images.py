@@ -13,7 +13,6 @@ from mvest.reporting.images import (
     COLUMNS,
     OVER_TIME,
     STEP_MM,
-    chosen_frames,
     leaflet_contours,
     measures_figure,
     montage_figure,
@@ -31,11 +30,6 @@ def valve():
 @pytest.fixture(scope="module")
 def volume(valve):
     return made_up_sequence.volume(valve, spacing=1.2)
-
-
-def own_axes(points):
-    turn, place = made_up_sequence.pose()
-    return (points - place) @ turn
 
 
 def test_planes_are_right_handed_and_hold_what_they_are_named_for(valve):
@@ -62,16 +56,6 @@ def test_planes_are_right_handed_and_hold_what_they_are_named_for(valve):
     for name in ALONG:
         assert planes[name].up @ turn[:, 2] > 0.9
         assert planes[name].coordinates(middle)[1] < -15
-
-
-def test_the_lowest_slice_cuts_both_leaflets(valve):
-    for frame in (0, 1):
-        plane = valve_planes(valve, frame)["at the free edge"]
-        first, second = leaflet_contours(valve, frame, plane)
-        assert len(first) > 5
-        assert len(second) > 5
-        # The anterior leaflet is the upper one.
-        assert first[..., 1].mean() > second[..., 1].mean()
 
 
 def test_contours_lie_on_the_leaflets_and_the_volume_is_bright_there(valve, volume):
@@ -146,14 +130,6 @@ def test_a_frame_without_a_valve_keeps_its_row(volume):
     figure = montage_figure(volume, valve, title="made up")
     assert [t.get_text() for t in panel(figure, 1, 2).texts] == ["no valve"]
     assert not panel(figure, 1, 2).images
-
-
-@pytest.mark.parametrize(
-    ("count", "closed", "expected"),
-    [(4, None, [0, 1, 2, 3]), (11, 7, [0, 2, 4, 7, 8, 10]), (101, 1, [0, 1, 40, 60, 80, 100])],
-)
-def test_frames_are_even_and_hold_the_first_and_the_closed(count, closed, expected):
-    assert chosen_frames(count, closed) == expected
 
 
 def test_a_valve_at_other_times_is_refused(valve, volume):

@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 
 from mvest.problem.record import EstimateRecord, Unknown
-from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Verdict
+from mvest.problem.verdict import NONE, TRUSTWORTHY, Verdict
 from mvest.reporting.skill import (
     log_width,
-    moduli_figure,
     prior_alone,
     score,
     share_bounds,
@@ -78,13 +77,6 @@ def test_what_anyone_could_say():
     assert score(shift) == pytest.approx(-1.0)
 
 
-def test_scores_are_of_the_logarithm():
-    middle, sd = 4.0, 0.1
-    row = answered(float(4.0 * np.exp(0.2)), middle, middle * np.exp(-1.959964 * sd),
-                   middle * np.exp(1.959964 * sd), 5.0)  # fmt: skip
-    assert score(row) == pytest.approx(2.0)
-
-
 @pytest.mark.parametrize(
     ("inside", "n", "low", "high"),
     [
@@ -115,11 +107,3 @@ def test_what_the_verdict_denies_has_no_numbers():
         11.0, None, None
     ]  # fmt: skip
     assert denied.unknowns[0].estimate == 11.0
-
-
-def test_the_figure_draws_every_interval_over_its_truth():
-    drawn = moduli_figure({"all": [(own, DOUBTFUL) for own in ASKED]})
-    (axes,) = drawn.axes
-    ends = [tuple(line.get_xdata()) for line in axes.lines if len(line.get_xdata()) == 2]
-    assert set(ends) >= {(0.9, 1.3), (0.7, 0.9), (0.5, 2.5)}
-    assert [text.get_text() for text in axes.texts] == ["no estimate"]

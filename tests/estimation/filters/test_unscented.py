@@ -12,19 +12,9 @@ from mvest.estimation import (
     Reason,
     UnscentedFilter,
 )
-from mvest.estimation.filters.unscented import simplex_points
 from tests.estimation.problems import Linear, square
 
 PRIOR, Y, R = Gaussian(np.array([2.0]), np.array([[1.0]])), np.array([6.0]), 2.0
-
-
-@pytest.mark.parametrize("size", [1, 2, 5])
-def test_corners_of_the_simplex_have_mean_zero_and_unit_covariance(size: int) -> None:
-    points = simplex_points(size)
-    np.testing.assert_allclose(points.sum(axis=0), 0.0, atol=1e-14)
-    np.testing.assert_allclose(points.T @ points / (size + 1), np.eye(size), atol=1e-14)
-    # Regular: all corners are as far from the centre, √p.
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), [np.sqrt(size)] * (size + 1))
 
 
 @pytest.mark.parametrize(
@@ -84,15 +74,6 @@ def test_points_draw_together_where_the_model_fails() -> None:
     assert "no valve" in found.detail
     assert found.prediction is None
     assert found.forward_solves == 7  # 1 + MAX_REJECTIONS, each ends at its first point
-
-
-def test_a_parameter_that_the_prior_holds_fixed_stays() -> None:
-    problem = Linear(p=2)
-    prior = Gaussian(problem.prior.mean, np.diag([1.0, 0.0]))
-    found = UnscentedFilter()(problem.plain, prior, problem.y, problem.R)
-    reference = IteratedFilter()(problem.differentiated, prior, problem.y, problem.R)
-    np.testing.assert_allclose(found.mean, reference.mean, rtol=1e-11)
-    np.testing.assert_allclose(found.covariance, reference.covariance, rtol=1e-10, atol=1e-14)
 
 
 def test_inadmissible_settings_and_models_are_refused() -> None:

@@ -80,18 +80,6 @@ def test_parameters_that_act_alike_are_named_with_how_one_makes_up_for_the_other
     assert exact.confounded(width=1e-4)[0].correlation == pytest.approx(group.correlation)
 
 
-def test_what_is_not_determined_is_told_as_such_and_not_as_a_correlation():
-    H = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 1.0]])
-    found = identifiability(H, 1.0, np.ones(3), names=("a", "b", "c"))
-    assert found.confounded() == ()
-    assert any("a" in words and "not determined at all" in words for words in found.flat())
-
-
-def test_what_is_known_to_no_better_than_its_size_has_no_percentage():
-    found = identifiability(np.diag([1.0, 0.04]), 0.01, np.ones(2), names=("a", "b"))
-    assert found.flat() == ("1.00 b: known to no better than its own size",)
-
-
 PRIOR = Gaussian(np.array([1.0, -1.0]), np.array([[0.5, 0.1], [0.1, 2.0]]))
 R = np.linspace(0.1, 0.4, 6)
 

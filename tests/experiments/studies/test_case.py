@@ -95,15 +95,6 @@ def test_a_run_is_recorded_and_reported(config, monkeypatch, tmp_path, unmeasure
     assert STUDY.words(back).index("checks passed") < STUDY.words(back).index("E_f anterior")
 
 
-def test_a_failed_estimation_has_a_record_too(config, monkeypatch, tmp_path, unmeasured):
-    use(monkeypatch, fails_above=4.0)
-    result = result_of(config, tmp_path)
-    assert (result.status, dict(result.arrays)) == ("failed", {})
-    record = stamp(config, "hash", result, 0.0)
-    # Nothing is drawn where nothing is estimated.
-    assert STUDY.files(tmp_path, record) == [tmp_path / "unknowns.csv"]
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -106,14 +106,10 @@ def test_a_program_that_fails_is_recorded_with_its_words(run, tmp_path):
     ("without", "changed", "message"),
     [
         (["command"], {}, "external.command is not given"),
-        ([], {"external.observation": "absent.csv"}, "absent.csv is missing"),
         ([], {"external.prior_std": "[1.0,-1.0]"}, "one standard deviation > 0"),
         ([], {"external.noise_mm": "0"}, "expected a number > 0 (mm)"),
         ([], {"filter.R": "0.1"}, "filter.R is given; expected external.noise_mm"),
-        ([], {"filter.initial": "[1.0]"}, "filter.initial has 1 values"),
-        ([], {"external.units": "[N/mm]"}, "external.units"),
         ([], {"external.differences": "exact"}, "central, forward"),
-        ([], {"external.inputs": "[mesh.vtk]"}, "cannot read mesh.vtk"),
     ],
 )
 def test_a_wrong_request_is_told_in_one_line(run, without, changed, message):
@@ -158,14 +154,3 @@ def test_several_models_estimate_from_what_one_of_them_predicts(tmp_path):
     assert one.truth == 3.0
     assert other.estimate == pytest.approx(one.estimate / 2, rel=1e-4)
     assert "runs" not in result.table_of().rows[1]
-
-
-@pytest.mark.parametrize(
-    ("python", "message"), [("absent.py:f", "no such file"), ("models.py:f", "'f'")]
-)
-def test_a_function_that_is_not_there_is_told(run, tmp_path, python, message):
-    (tmp_path / "models.py").write_text(MODELS)
-    status, _, err = run("command", **{"external.python": python})
-    assert status == 2
-    assert message in err
-    assert len(err.strip().splitlines()) == 1

@@ -9,10 +9,8 @@ from experiments.common.building.closure import closure_model
 from experiments.common.building.gate import anatomy_digest, gate_of
 from experiments.common.places import GATE_RECORDS
 from experiments.common.records.record import NOT_GATED, Record, read_record, stamp
-from experiments.common.records.writer import write_results
-from experiments.common.study import Result, Results
+from experiments.common.study import Result
 from experiments.results.published import records_of, write_records
-from experiments.studies.gate import STUDY
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GATE_CASES, MAX_LIMIT, MEAN_LIMIT, GateCase
 from mvest.closure.smoothness import JUMP_LIMIT
@@ -62,18 +60,6 @@ def run(run_here):
         return status, read_record(folder / "result.json"), folder, said
 
     return call
-
-
-def test_all_anatomies_are_one_table(tmp_path):
-    calm = record_of("template", True, ("mesh x 1.5", 0.07))
-    other = record_of("prolapse", False, ("mesh x 1.5", None), ("ramp / 3", 0.61))
-    write_results(tmp_path, STUDY, Results({"a": calm, "b": other}))
-    page = (tmp_path / "gate.md").read_text()
-    assert "| mesh x 1.5 | 0.07 | – |" in page
-    assert "| ramp / 3 | – | 0.61 |" in page
-    assert "reference" not in page
-    assert "| prolapse | no |" in page
-    assert (tmp_path / "gate_variations.csv").read_text().count("\n") == 1 + 1 + 2 + 3
 
 
 def test_a_verdict_is_looked_up_by_the_anatomy_and_not_by_its_name(tmp_path):

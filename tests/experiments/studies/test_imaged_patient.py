@@ -12,14 +12,12 @@ from experiments.common.cases.own_case import PersonalSettings
 from experiments.common.records.record import Record
 from experiments.common.schema import build
 from experiments.common.study import Job, Results
-from experiments.results.published import publish, records_of
 from experiments.studies import imaged_patient
-from experiments.studies.imaged_patient import HIDDEN, KNOWN, SEGMENTED, STUDY, VOLUME, summary
+from experiments.studies.imaged_patient import HIDDEN, KNOWN, SEGMENTED, VOLUME, summary
 from experiments.studies.imaged_patient import TRUTH as TRUTH_FOLDER
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, Verdict
-from mvest.reporting.tables import table
 from mvest.simulation.virtual_patient import PatientSettings
 from tests.experiments.studies.made_up import made_up
 from tests.experiments.studies.made_up_patients import a_result
@@ -180,25 +178,3 @@ def test_bias_and_how_far_estimates_follow_the_truth():
     assert volume["bias SE"] == pytest.approx(np.std(log - np.log(truth), ddof=1) / 2)
     assert volume["slope"] == pytest.approx(0.5)
     assert (known["bias"], known["slope"]) == pytest.approx((np.log(1.2), 1.0))
-
-
-def test_lengths_of_chordae_are_of_all_patients_that_have_them():
-    def chordae(ratios: dict[str, list[float]]) -> dict[str, Any]:
-        own = [{"family": f, "ratio": one} for f, each in ratios.items() for one in each]
-        return {"tables": {"chordae": table(own).plain()}}
-
-    records = [
-        record("a", MODULI, (5.0, 2.0), (5.0, 2.0), **chordae({"marginal": [1.0, 1.04]})),
-        record("b", MODULI, (5.0, 2.0), (5.0, 2.0)),
-        record("c", MODULI, (5.0, 2.0), (5.0, 2.0), **chordae({"marginal": [0.98]})),
-    ]
-    (row,) = rows(records, "chordae")
-    assert (row["ratio"], row["SD"]) == pytest.approx((1.00667, 0.03055), abs=1e-5)
-
-
-def test_the_table_is_that_of_all_patients(tmp_path):
-    for one in (FIRST, LOST, FIRST):
-        # Run again, a patient takes its own place.
-        publish(STUDY, tmp_path, {f"volumes-{one.row}": (one, tmp_path / "no such folder")})
-    assert list(records_of(tmp_path, "volume").records) == ["volumes-one", "volumes-two"]
-    assert (tmp_path / "volume.csv").read_text().count("E_f.anterior") == 2

@@ -14,11 +14,8 @@ from experiments.common.records.record import Record
 from experiments.common.study import Results
 from experiments.results.published import publish, records_of
 from experiments.studies.patient import study
-from experiments.studies.patient.figures import figure_3
 from experiments.studies.patient.study import KEPT_ARRAYS, STUDY, figure, keep, summary
 from mvest.cases.case import Role
-from mvest.errors import InputError
-from mvest.problem.fields import case_fields
 from mvest.problem.record import Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, FailedCheck, Verdict
 from tests.experiments.studies.made_up import SOURCE
@@ -135,21 +132,6 @@ def test_publishing_keeps_a_patient_and_renews_the_tables(tmp_path, fields_file,
         assert set(stored.files) <= set(KEPT_ARRAYS)
     published("patients-prolapse", patient("prolapse"))
     assert "prolapse" in (tmp_path / "patients_table_2.csv").read_text()
-
-
-def test_figure_3_has_one_scale_for_all_and_names_patients_without_an_estimate(fields_file):
-    fields = case_fields(fields_file)
-    far = replace(fields, distance_generic=5 * fields.distance_generic)
-    drawn = figure_3({"near": fields, "far": far}, ["far"])
-    *panels, bar = drawn.axes
-    titles = [axes.get_title() for axes in panels]
-    assert [title.startswith("NO ESTIMATE") for title in titles] == [False, False, False, True]
-    # The frame that the filter was shown, not the one that was held out.
-    assert f"{np.mean(fields.distance_fitted[0]):.2f}" in titles[2]
-    assert bar.get_ylim()[0] == 0.0
-    assert bar.get_ylim()[1] > np.median(far.distance_generic[far.closed])
-    with pytest.raises(InputError, match="Figure 3 needs the distances"):
-        figure_3({"one": replace(fields, distance_fitted=None)})
 
 
 # -- the population ------------------------------------------------------------------------------

@@ -46,15 +46,6 @@ def test_each_landmark_is_found_by_its_own_trees(true):
     np.testing.assert_allclose(spread, 0, atol=1e-6)
 
 
-def test_samples_say_where_the_landmark_is_in_the_valves_axes(shape, true):
-    for which in (0, 5, 10, 11):
-        x, y = module.landmark_samples(made.labelled(true, shape, which), which, 40)
-        points, rotation, _, _ = made.seen(x)
-        aim = points + np.einsum("pij,pj->pi", rotation, y)
-        np.testing.assert_allclose(aim, np.tile(points_of(true)[which], (40, 1)), atol=1e-9)
-        assert 2.0 < np.linalg.norm(y, axis=1).mean() < 15.0
-
-
 # -- votes ---------------------------------------------------------------------------------------
 
 
@@ -67,16 +58,6 @@ def test_a_third_of_outliers_does_not_count():
     found, _ = module.consensus(votes[None])
     assert np.linalg.norm(found[0] - right) < 0.3
     assert np.linalg.norm(votes.mean(axis=0) - right) > 3
-
-
-def test_votes_spread_by_their_distance():
-    # Votes on spheres about two points: their root mean square distances are the radii.
-    ray = np.random.default_rng(1).standard_normal((1, 200, 3))
-    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
-    sphere = np.concatenate([ray, -ray], axis=1)
-    found, spread = module.consensus(np.concatenate([2.0 * sphere, 50.0 + 4.0 * sphere]))
-    np.testing.assert_allclose(found, [[0.0] * 3, [50.0] * 3], atol=1e-6)
-    np.testing.assert_allclose(spread, [2.0, 4.0], rtol=1e-6)
 
 
 # -- rims ----------------------------------------------------------------------------------------
@@ -179,6 +160,16 @@ def test_the_leaflets_are_found_along_their_normals(true, reach):
     assert np.all((std > 0.1) & (std < 1.0))
 
 
+def test_votes_spread_by_their_distance():
+    # Votes on spheres about two points: their root mean square distances are the radii.
+    ray = np.random.default_rng(1).standard_normal((1, 200, 3))
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    sphere = np.concatenate([ray, -ray], axis=1)
+    found, spread = module.consensus(np.concatenate([2.0 * sphere, 50.0 + 4.0 * sphere]))
+    np.testing.assert_allclose(found, [[0.0] * 3, [50.0] * 3], atol=1e-6)
+    np.testing.assert_allclose(spread, [2.0, 4.0], rtol=1e-6)
+
+
 def test_trees_that_see_nothing_pull_nowhere_and_are_unsure(true):
     # Places that reach farther to one side than to the other pull to that side.
     blind = {"boundary": made.Oracle(1, lambda x: np.full((len(x), 1), 0.02))}
@@ -188,15 +179,3 @@ def test_trees_that_see_nothing_pull_nowhere_and_are_unsure(true):
     np.testing.assert_allclose(offset, 0, atol=1e-9)
     assert np.all(std > 1.0)
     np.testing.assert_allclose(confidence, 0.02)
-
-
-def test_samples_are_rated_by_their_distance_from_the_true_leaflet(shape, other):
-    x, y = module.boundary_samples(made.labelled(other, shape), 720)
-    assert y.shape == (len(x), 1)
-    assert y.min() >= 0
-    assert y.max() <= 1
-    gap = np.linalg.norm(made.seen(x)[0][:, None] - other.vertices, axis=2).min(axis=1)
-    # Far from every vertex is off the leaflet; about half of all places are near it.
-    assert y[gap > 6.0].mean() < 0.15
-    assert y[gap < 0.5].mean() > 0.6
-    assert 0.28 < np.mean(y > 0.3) < 0.5

@@ -3,8 +3,6 @@
 Places rated whatever the orientation. Shape and tips read off at a pose.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -109,19 +107,6 @@ def test_the_best_place_is_first_and_others_are_apart(true, monkeypatch):
     assert gap[0] < 6.0
     between = np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(6, dtype=bool)]
     assert between.min() >= 0.8 * pose_search.NEAR_MM
-
-
-def test_samples_are_rated_by_their_distance(shape, true, frame, monkeypatch):
-    centred = true._replace(pose=replace(true.pose, centre=POINT[None]))
-    monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
-    points, y = pose_search.position_samples(made.labelled(centred, shape, frame=frame), 100)
-    assert y.shape == (100, 1)
-    gap = np.linalg.norm(points - POINT, axis=1)
-    order = np.argsort(gap)
-    assert np.all(np.diff(y[order, 0]) <= 1e-12)
-    assert y[gap < 2.0].min() > 0.8
-    assert y[gap > 20.0].max() < 0.05
-    assert np.any(gap > 15.0)
 
 
 def test_coefficients_and_tips_come_back_as_they_were_learned(shape, true):

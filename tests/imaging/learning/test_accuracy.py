@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mvest.errors import InputError
 from mvest.imaging.learning.accuracy import (
     correlogram,
     fitted_length,
@@ -74,13 +73,6 @@ def test_errors_are_stated_wider_where_there_is_less_confidence():
     # Smaller errors with less confidence are luck, and are not extrapolated.
     lucky = widened(accuracy, np.full(40, 0.95), wide / 6.0, np.full(30, 0.75))
     assert lucky.widening[1] == 0.0
-
-
-@pytest.mark.parametrize("value", [1.0, np.nan])
-def test_errors_that_tell_nothing_are_refused(value):
-    errors = np.full((3, 2, 140, 3), value)
-    with pytest.raises(InputError, match="none at some vertex"):
-        measure_accuracy(errors, np.ones((3, 2, 2, 3)), sheet())
 
 
 @pytest.mark.parametrize("count", [9, 60])
