@@ -82,14 +82,6 @@ def test_another_return_is_one_line_that_says_what_is_expected(use: str) -> None
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("use", ["IteratedFilter", "expectation", "some parameters"])
-def test_derivatives_by_other_parameters_are_refused(use: str) -> None:
-    with pytest.raises(InputError, match=r"2 parameters.*shape \(6, 3\)"):
-        USES[use](lambda m: (Y, np.ones((6, 3))))
-    with pytest.raises(InputError, match=r"derivatives.*shape \(6, 0\)"):
-        USES[use](lambda m: Prediction.undifferentiated(Y))
-
-
 def test_a_model_cannot_write_on_its_parameters_and_fails_by_a_material_error() -> None:
     def writes(m: np.ndarray) -> Prediction:
         m[:] = 0.0

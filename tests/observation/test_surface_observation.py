@@ -102,15 +102,6 @@ def scattered(n: int, z: float | np.ndarray, seed: int = 1) -> np.ndarray:
     return np.column_stack([rng(seed).uniform(1.0, 9.0, (n, 2)), np.broadcast_to(z, n)])
 
 
-def whitened(prediction: Prediction, R: object) -> np.ndarray:
-    return observation_noise(R, len(prediction.y)).whiten(prediction.jacobian)
-
-
-def information(prediction: Prediction, R: object) -> np.ndarray:
-    A = whitened(prediction, R)
-    return A.T @ A
-
-
 # --- distances ----------------------------------------------------------------------------------
 
 

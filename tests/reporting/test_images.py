@@ -84,7 +84,7 @@ def test_a_slice_shows_a_known_gradient(volume):
     assert np.isnan(resample(ramp, 0, plane, (500.0, 504.0, 0.0, 4.0))).all()
 
 
-ANNULUS, TIPS = "annulus, within 3 mm", "papillary tip, within 3 mm"
+TIPS = "papillary tip, within 3 mm"
 
 
 def panel(figure, row, column):
@@ -114,12 +114,6 @@ def test_the_montage_has_frames_in_rows_and_draws_the_valve_on_them(valve, volum
     tips = panel(figure, 1, 0)
     assert len(drawn(tips, TIPS).get_xdata()) == 2
     assert len(drawn(axes, TIPS).get_xdata()) == 0
-    # A saddle 6.5 mm high: most of the annulus is within 3 mm of its plane.
-    assert len(drawn(panel(figure, 1, 2), ANNULUS).get_xdata()) > 40
-    # All panels have one scale.
-    figure.draw_without_rendering()
-    per_mm = [axes.get_window_extent().width / np.ptp(axes.get_xlim()) for axes in figure.axes]
-    assert max(per_mm) / min(per_mm) < 1.03
 
 
 def test_a_frame_without_a_valve_keeps_its_row(volume):
@@ -161,7 +155,6 @@ def test_measures_over_time_have_gaps_hollow_frames_and_bands():
     area = titled(figure, "Annulus area")
     curves = {line.get_label(): line for line in area.lines}
     np.testing.assert_allclose(curves["projected"].get_xdata(), [0, 50, 100, 150])
-    np.testing.assert_allclose(curves["in space"].get_ydata(), [800, 801, 802, 803])
     hollow = [line for line in area.lines if line.get_markerfacecolor() == "white"]
     assert [list(line.get_xdata()) for line in hollow] == [[50.0], [50.0]]
     tenting = drawn(titled(figure, "Closed leaflets"), "tenting height")
@@ -173,13 +166,5 @@ def test_measures_over_time_have_gaps_hollow_frames_and_bands():
     corners = np.concatenate([path.vertices for path in band.get_paths()])
     assert (corners[:, 1].min(), corners[:, 1].max()) == (20.0, 31.0)
     assert 50.0 not in corners[:, 0]
-    # The legend is above the curves.
-    low, high = diameters.get_ylim()
-    assert low < 20.0
-    assert high > 803.0 + 0.3 * (803.0 - 20.0)
-    assert not area.collections
     note = " ".join(text.get_text() for text in figure.texts)
     assert "1 of 4 frames" in note
-    assert "Bands: 95 %" in note
-    plain = measures_figure([measures(0)], title="made up", low_confidence=0.7)
-    assert not any("Bands" in text.get_text() for text in plain.texts)

@@ -154,9 +154,7 @@ def test_the_closure_study_measures_every_step(run):
     with np.load(folder / "fields.npz") as fields:
         assert fields["frames"].shape == (3, 160, 3)
         assert fields["triangles"].shape == (2 * 128 + 2 * 32, 3)
-        assert fields["region"].shape == fields["triangles"].shape[:1]
         assert np.isfinite(fields["frames"]).all()
-        assert fields["stress"].shape == fields["contact_pressure"].shape == (3, 160)
         # Contact acts within two thicknesses of midsurfaces, one of faces: that of the free edge.
         assert 0.5 < fields["reach_mm"] < 1.32
     names = {path.name for path in folder.iterdir()}

@@ -71,16 +71,11 @@ def test_the_study_says_how_far_detectors_are_off(done: Path):
     assert {row["kind"]: row["volumes"] for row in kinds} == dict(
         zip(KINDS, (2, 2, 1, 1, 1, 2, 2, 1, 1), strict=True)
     )
-    errors = {(row["error"], row["kind"]): row for row in record.table_of("errors").rows}
-    assert errors["annulus_area", "shifted"]["unit"] == "%"
-    assert ("surface", "calibration") not in errors
     coverage = record.table_of("coverage").rows
     assert [(row["kind"], row["frame"]) for row in coverage] == [
         (kind, frame) for kind in ("sequence", "shifted sequence") for frame in ("open", "closed")
     ]
     for row in coverage:
-        assert min(row["within_95"], row["within_95_handed_on"]) >= 0
-        assert max(row["within_95"], row["within_95_handed_on"]) <= 100
         assert min(row["rms_handed_on"], row["stated_handed_on"]) > 0
 
 
@@ -129,8 +124,6 @@ def test_given_detectors_are_tested_and_none_is_trained(done: Path, capsys):
     capsys.readouterr()
     assert call(done, given, "imaging.train.seed=9", "imaging.calibration.seed=1") == 2
     assert "was trained on, expected other valves" in capsys.readouterr().err
-    assert call(done, given, "imaging.evaluate=false") == 2
-    assert "nothing would be done" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -158,11 +151,10 @@ def test_cached_parts_are_named_by_what_they_are_made_of():
 
     base = names()
     assert names("imaging.processes=2", "imaging.held_out.volumes=9") == base
-    for trees in ("imaging.training.many_trees=5", "imaging.training.volumes=9"):
-        # More volumes go on from those that are there.
-        other = names(trees)
-        assert other[:2] == base[:2]
-        assert other[2] != base[2]
+    # More volumes go on from those that are there.
+    other = names("imaging.training.volumes=9")
+    assert other[:2] == base[:2]
+    assert other[2] != base[2]
     assert names("imaging.training.draft_volumes=2")[1] != base[1]
     other = names("seed=3")
     assert other[0] == base[0]

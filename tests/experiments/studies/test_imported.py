@@ -85,8 +85,6 @@ def test_a_recorded_valve_end_to_end(run, tmp_path: Path) -> None:
         assert all(one.truth is None for one in found.unknowns)
         assert estimate == pytest.approx(TRUTH, rel=0.1)
         assert row["mean"] < 0.5 * rows[0]["mean"]
-    names = {path.name for path in (tmp_path / "here").iterdir()}
-    assert {"donor.csv", "donor.md", "donor.png", "result.json", "fields.npz"} <= names
     # Overrides keep a run out of the results.
     assert not (tmp_path / "published").exists()
 

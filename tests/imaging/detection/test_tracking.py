@@ -8,7 +8,6 @@ import pytest
 from mvest.imaging.detection import pose_search, tracking
 from mvest.imaging.detection.detect import NoValveError, fit_frame
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.tracking import detect_valve, smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.volume import VolumeSequence
@@ -23,7 +22,6 @@ from tests.imaging.detection.made_up import (
 
 TIMES = np.array([0.0, 0.03, 0.05, 0.09])
 FRAMES = [made.NumberedFrame(k) for k in range(4)]
-STEPS = [f"pose_refine_{k}" for k in range(3)]
 
 
 @pytest.fixture
@@ -144,25 +142,6 @@ def test_the_consistent_hypothesis_is_taken_though_one_frame_rates_another_highe
     frames = [hypotheses([here, there], [0.9, 0.1])] * 2
     frames += [hypotheses([there], [0.9]), *[hypotheses([there, here], [0.1, 0.9])] * 2]
     assert tracking._best_path(frames, 0.02 * np.arange(5), model) == [0, 0, 0, 1, 1]
-
-
-def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, truths):
-    # Every frame by itself, or without the hypotheses of the others, would lose one of them.
-    far = made.placed(
-        shape, truths[2].pose.moved(np.array([[0, 30.0, 0, 0, 0, 0, 0]])), np.zeros(2)
-    )
-    right = made.rating_oracle(truths, shape, 0.6)
-    wrong = made.rating_oracle([*truths[:2], far, truths[3]], shape, 0.9)
-    rating = made.Oracle(1, lambda x: np.maximum(right(x), wrong(x)))
-    model = made.oracle_model(shape, truths)
-    still = made.Oracle(7, lambda x: np.zeros((len(x), 7)))
-    model.boosters.update(dict.fromkeys(STEPS, still), pose_coarse=rating, pose_fine=rating)
-    model.boosters["position"] = made.position_oracle([*truths[:2], far, truths[3]])
-    alone = search_poses(FRAMES[2], model.boosters, 1)[0]
-    assert np.linalg.norm(alone.centre - far.pose.centre) < 6
-    found = tracking._trajectory(FRAMES, TIMES, model)
-    expected = np.concatenate([t.pose.centre for t in truths])
-    assert np.linalg.norm(found.centre - expected, axis=1).max() < 10.0
 
 
 UNEVEN = np.array([0.0, 0.02, 0.03, 0.07, 0.08, 0.13, 0.15])

@@ -56,13 +56,6 @@ def test_what_is_drawn_lies_in_the_ranges_and_fills_them(spread):
     assert {a.shape for a in drawn} == {base.shape}
 
 
-def test_unknown_spreads_and_draws_out_of_range_are_refused():
-    with pytest.raises(InputError, match="spread 'wild', expected one of training, wide, shifted"):
-        draw_acquisition(np.random.default_rng(0), spread="wild")
-    with pytest.raises(InputError, match="dropout"):
-        draw_acquisition(np.random.default_rng(0), replace(SMALL, dropout=0.6), "shifted")
-
-
 # -- the probe ------------------------------------------------------------------------------------
 def test_drawn_probes_look_at_the_valve_from_the_atrium():
     rng, acquisition = np.random.default_rng(0), Acquisition()
