@@ -4,17 +4,21 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from experiments.common.records.record import Record, read_record
 from experiments.common.schema import build
+from experiments.results.published import records_of
 from experiments.run import main
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore
 from experiments.studies.imaging.study import Settings, calibrated, error_rows, judge, kind_rows
 from mvest.errors import InputError
 from mvest.imaging.detection.trained_model import DetectionModel, load_model, save_model
-from mvest.simulation.trials import KINDS, WITHOUT_VALVE
+from mvest.reporting.tables import table
+from mvest.simulation.trials import KINDS
 from tests.experiments.configured import composed, plain
+from tests.places import ROOT
 
 STUDY = (
     "experiment=imaging",
@@ -162,16 +166,20 @@ def test_cached_parts_are_named_by_what_they_are_made_of():
     assert not set(names("imaging.train.seed=9")) & set(base)
 
 
-# -- tables of made-up trials ---------------------------------------------------------------------
-def volume(kind: str, surface: float, confidence: float = 0.9, **more) -> dict:
-    return {
-        "kind": kind, "confidence": confidence, "surface": surface, "points": 2 * surface,
-        "tips": 1.0, "annulus_area": 2.0, "ap_diameter": -0.5, "state_right": 100.0,
-    } | more  # fmt: skip
-
-
-def without(kind: str, confidence: float) -> dict:
-    return {"kind": kind, "confidence": confidence}
+# -- tables ---------------------------------------------------------------------------------------
+def test_the_published_tables_follow_from_the_published_trials():
+    record = records_of(ROOT / "results", "imaging").first
+    limits = ("called_a_valve_from_confidence", "not_the_valve_from_mm", "unlike_below_confidence")
+    published = pd.DataFrame(record.table_of("trials").values)
+    trials = judge(record.table_of("trials").rows, *(record.numbers[name] for name in limits))
+    for name in ("called", "right", "unlike"):
+        stored = published[name].notna()
+        assert trials.loc[stored, name].tolist() == published.loc[stored, name].tolist()
+    for name, rows in (("", kind_rows(trials)), ("errors", error_rows(trials))):
+        # The published counts of unlike sequences follow from an earlier limit.
+        now = pd.DataFrame(table(rows).values).drop(columns="unlike", errors="ignore")
+        then = pd.DataFrame(record.table_of(name).values)[list(now)]
+        pd.testing.assert_frame_equal(now, then, check_dtype=False, rtol=1e-12)
 
 
 def sequence(kind: str, confidence: float, off: float) -> dict:
@@ -181,60 +189,6 @@ def sequence(kind: str, confidence: float, off: float) -> dict:
         "kind": kind, "confidence": confidence, "median_confidence": confidence - 0.1,
         "valve": f"{off}", **dict.fromkeys(names, off),
     }  # fmt: skip
-
-
-ROWS = [
-    volume("shifted", 1.0),
-    volume("in distribution", 0.4, annulus_area=-6.0, ap_diameter=1.0),
-    volume("in distribution", 0.6, annulus_area=2.0, ap_diameter=-1.5, state_right=0.0),
-    volume("in distribution", 2.0, 0.95, annulus_area=1.0, ap_diameter=-1.0, state_right=None),
-    volume("in distribution", 3.0, 0.1),
-    without("walls only", 0.2),
-]
-
-
-def by_kind(rows: list[dict], *limits: float) -> dict:
-    return {row.kind: row for row in kind_rows(judge(rows, *limits)).itertuples()}
-
-
-def test_a_kind_is_summarised_over_its_volumes():
-    # A valve that was not found is no valve below 1.5 mm.
-    row = by_kind(ROWS, 0.5, 5.0, 0.85)["in distribution"]
-    assert (row.volumes, row.called_a_valve, row.below_limit) == pytest.approx((4, 75.0, 50.0))
-    assert (row.state_right, row.wrong_yet_like) == (50.0, 25.0)
-    # Wrong detections with a confidence that is unlike the training's are not believed.
-    assert by_kind(ROWS, 0.5, 5.0, 0.96)["in distribution"].wrong_yet_like == 0.0
-    rows = [
-        volume("in distribution", 1.0, 0.9),
-        volume("in distribution", 8.0, 0.6),
-        volume("in distribution", 1.0, 0.4),
-        *(without(kind, 0.2) for kind in WITHOUT_VALVE),
-        sequence("calibration", 0.8, 1.0),
-    ]
-    found = by_kind(rows, 0.5, 5.0, 0.75)
-    row = found["in distribution"]
-    assert (row.volumes, row.lowest, row.median, row.highest) == (3, 0.4, 0.6, 0.9)
-    assert row.wrongly_so == pytest.approx(100 / 3)
-    assert (row.lost, row.unlike) == (2, 2)
-    assert (found["walls only"].lost, found["walls only"].wrongly_so) == (0, 0)
-    # Over time the median frame decides whether a volume is unlike.
-    assert (found["calibration"].lost, found["calibration"].unlike) == (0, 1)
-
-
-def test_errors_are_summarised_over_detected_valves():
-    over_time = [sequence("sequence", 0.9, 1.0), sequence("sequence", 0.8, 2.0),
-                 sequence("sequence", 0.3, 9.0), sequence("calibration", 0.9, 5.0)]  # fmt: skip
-    found = {
-        (row.error, row.kind): row
-        for row in error_rows(judge([*ROWS, *over_time], 0.5, 5.0, 0.0)).itertuples()
-    }
-    surface = found["surface", "in distribution"]
-    assert (surface.volumes, surface.mean, surface.median) == pytest.approx((3, 1.0, 0.6))
-    assert surface.percentile_90 == pytest.approx(1.72)
-    diameter, closed = found["ap_diameter", "in distribution"], found["surface_closed", "sequence"]
-    assert diameter.mean == pytest.approx(3.5 / 3)
-    assert (closed.volumes, closed.mean) == (2, 1.5)
-    assert not [key for key in found if key[1] == "calibration"]
 
 
 def test_errors_are_stated_of_valves_that_were_detected_only():
