@@ -101,34 +101,24 @@ def test_an_inadmissible_sheet_is_refused(change):
         SecondSheet(TINY, "hooke")
 
 
-def sheet_program(folder, **settings):
-    """The tiny sheet as a program."""
-    return ProcessModel(
+def test_the_program_predicts_what_the_library_predicts(tmp_path):
+    expected = SecondSheet(TINY)(M)
+    program = ProcessModel(
         Command((sys.executable, str(FILE), "{request}", "{folder}"), {}, 60.0),
-        folder,
+        tmp_path,
         PARAMETERS,
         len(TINY.points),
         units=("MPa", "MPa"),
-        settings={"cells": [2, 2], "observed": [4, 3], "load_steps": 2, **settings},
-        differences=Differences("central", 1e-3, processes=2),
+        settings={"cells": [2, 2], "observed": [4, 3], "load_steps": 2},
+        differences=Differences("central", 1e-3),
         reuse=False,
     )
-
-
-def test_the_program_predicts_what_the_library_predicts(tmp_path):
-    expected = SecondSheet(TINY)(M)
-    program = sheet_program(tmp_path)
     answer = program(M)
     assert answer.converged, answer.reason
     # Another process may add up in another order; files that lose digits would show at 1e-7.
     np.testing.assert_allclose(answer.y, expected.y, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(answer.jacobian, expected.jacobian, rtol=1e-10, atol=1e-12)
-    alone = sheet_program(tmp_path, derivatives=False)
-    found = alone(M)
-    assert (program.runs, alone.runs) == (1, 5)
-    # Central differences of a relative step s err by about s^2.
-    size = np.abs(expected.jacobian).max()
-    np.testing.assert_allclose(found.jacobian, expected.jacobian, atol=1e-5 * size)
+    assert program.runs == 1
 
 
 def test_the_program_passes_on_a_failure(tmp_path):

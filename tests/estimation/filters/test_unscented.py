@@ -5,7 +5,6 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.estimation import (
-    ExtendedFilter,
     Gaussian,
     IteratedFilter,
     Prediction,
@@ -15,30 +14,6 @@ from mvest.estimation import (
 from tests.estimation.problems import Linear, square
 
 PRIOR, Y, R = Gaussian(np.array([2.0]), np.array([[1.0]])), np.array([6.0]), 2.0
-
-
-@pytest.mark.parametrize(
-    ("filter_", "solves"),
-    [
-        (ExtendedFilter(), 2),  # at the prior's mean and at the estimate
-        (UnscentedFilter(max_iterations=1), 5),  # p + 1 = 4 points, and the estimate
-        (UnscentedFilter(), 9),  # a second round finds that nothing changes
-        (UnscentedFilter(spread=0.1), 9),
-    ],
-)
-def test_on_a_linear_model_it_is_the_kalman_filter(filter_, solves: int) -> None:
-    problem = Linear()
-    found = problem.by(filter_, plain=not isinstance(filter_, ExtendedFilter))
-    np.testing.assert_allclose(found.mean, problem.mean, rtol=1e-11)
-    np.testing.assert_allclose(found.covariance, problem.covariance, rtol=1e-10, atol=1e-11)
-    assert found.converged
-    assert found.forward_solves == solves
-    assert found.prediction is not None
-    np.testing.assert_allclose(found.prediction.jacobian, problem.H, atol=1e-11)
-    reference = problem.by(IteratedFilter())
-    assert found.innovation.nis == pytest.approx(reference.innovation.nis, rel=1e-10)
-    assert found.log_likelihood[-1] == pytest.approx(reference.log_likelihood[-1], rel=1e-10)
-    assert found.objective[-1] == pytest.approx(reference.objective[-1], rel=1e-10)
 
 
 def test_hand_worked_rounds_on_a_square() -> None:
