@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mvest.errors import GeometryError, InputError
+from mvest.errors import InputError
 from mvest.estimation import observation_noise
 from mvest.estimation.noise import stacked_noise
 from mvest.observation.errors import (
@@ -98,14 +98,6 @@ def test_vertices_near_the_other_leaflet_are_not_seen() -> None:
     # the foot would lie beyond the edge: 0.5, 1.06, 1.77, ...: two rows.
     assert hidden[:10].reshape(2, 5).tolist() == [[True, True] + [False] * 3] * 2
     np.testing.assert_array_equal(seen[1][~hidden], true[1][~hidden])
-
-
-def test_a_drop_out_of_everything_is_refused() -> None:
-    surface, closed = facing(0.5)
-    with pytest.raises(GeometryError, match="hides every vertex"):
-        observe(closed[None], [CoaptationDropout(9.0, surface)], rng())
-    with pytest.raises(InputError, match="drop-out distance = -1"):
-        CoaptationDropout(-1.0, surface)
 
 
 def test_the_annulus_offset_moves_the_closed_frame_as_one() -> None:

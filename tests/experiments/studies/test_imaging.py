@@ -24,7 +24,8 @@ STUDY = (
     "experiment=imaging",
     "imaging=small",
     "tracking.enabled=false",
-    # Half the voxels in the same field of view.
+    # Two frames, and half the voxels in the same field of view.
+    "imaging.population.motion.frames=2",
     "imaging.training.acquisition.voxel_mm=2.5",
     "imaging.training.acquisition.shape=[40,32,40]",
 )

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from mvest.imaging.learning.accuracy import (
-    correlogram,
-    fitted_length,
     matern,
     measure_accuracy,
     share_within,
@@ -45,16 +43,6 @@ def test_size_and_length_are_found_whatever_the_mean_error():
     assert accuracy.correlation_length_mm == pytest.approx(LENGTH, rel=0.15)
     assert accuracy.samples.shape == errors.shape
     assert accuracy.tip_samples is tips
-
-
-def test_few_samples_have_no_bias_and_independent_errors_no_length():
-    std = np.linspace(0.3, 1.2, len(sheet()))
-    tips = np.ones((3, 2, 2, 3))
-    few = [measure_accuracy(fields(3, std, k), tips, sheet()).std_mm for k in range(30)]
-    assert np.sqrt(np.mean(np.square(few), axis=0)).mean() == pytest.approx(std.mean(), rel=0.05)
-    white = np.random.default_rng(2).standard_normal((500, len(sheet())))
-    assert correlogram(white, sheet())[0].max() < 30
-    assert fitted_length(*correlogram(white, sheet())) < 1.5
 
 
 def test_errors_are_stated_wider_where_there_is_less_confidence():

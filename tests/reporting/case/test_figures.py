@@ -9,9 +9,7 @@ from matplotlib.collections import PolyCollection, QuadMesh
 from mvest.errors import InputError
 from mvest.problem.fields import case_fields
 from mvest.reporting.case.drawing import (
-    BLOOD,
     LINE_PIECES,
-    TISSUE,
     distance_top,
     leak_of,
 )
@@ -166,18 +164,6 @@ def test_every_frame_of_a_case_is_drawn_from_two_sides_on_one_scale(corresponds)
     # Chordae are drawn in every frame whose vertices are those of the reference frame.
     opened, closed, _ = (len(faces(axes).get_paths()) for axes in figure.axes[3:])
     assert (opened == closed) is corresponds
-
-
-def test_a_slit_of_touching_leaflets_differs_from_a_leak_if_their_reach_is_known(fields):
-    def colours(reach):
-        axes = case_figure(replace(fields, reach_mm=reach)).axes[0]
-        drawn = [mesh.get_array()[mesh.get_array()[..., 3] > 0] for mesh in leaks(axes)]
-        return [{tuple(np.round(colour[:3], 2)) for colour in one} for one in drawn]
-
-    assert colours(None) == []
-    # Nothing touches within no distance, and everything does within the size of the valve.
-    assert colours(0.0) == [{BLOOD}]
-    assert colours(200.0) == [{TISSUE}]
 
 
 def test_the_scene_has_the_gap_in_its_place(fields):
