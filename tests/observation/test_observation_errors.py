@@ -138,3 +138,13 @@ def test_scales_multiply_standard_deviations() -> None:
         )
         W = observation_noise(seen.R, 6).whiten(np.eye(6))
         np.testing.assert_allclose(np.diag(np.linalg.inv(W.T @ W)), expected, rtol=1e-9)
+
+
+def test_what_is_near_at_rest_is_no_coaptation() -> None:
+    surface, _ = facing(0.5)
+    joined = LeafletSurface(
+        facing(0.5)[1], surface.triangles, surface.region, surface.region_names,
+        surface.fibre, surface.thickness,
+    )  # fmt: skip
+    true = joined.vertices[None]
+    np.testing.assert_array_equal(observe(true, [CoaptationDropout(1.2, joined)], rng()), true)

@@ -13,6 +13,7 @@ from mvest.reporting.images import (
     COLUMNS,
     OVER_TIME,
     STEP_MM,
+    chosen_frames,
     measures_figure,
     montage_figure,
     resample,
@@ -155,3 +156,11 @@ def test_measures_over_time_have_gaps_hollow_frames_and_bands():
     assert 50.0 not in corners[:, 0]
     note = " ".join(text.get_text() for text in figure.texts)
     assert "1 of 4 frames" in note
+
+
+@pytest.mark.parametrize(
+    ("count", "closed", "expected"),
+    [(4, None, [0, 1, 2, 3]), (11, 7, [0, 2, 4, 7, 8, 10]), (101, 1, [0, 1, 40, 60, 80, 100])],
+)
+def test_frames_are_even_and_hold_the_first_and_the_closed(count, closed, expected):
+    assert chosen_frames(count, closed) == expected
