@@ -109,3 +109,28 @@ def test_trees_that_see_nothing_pull_nowhere_and_are_unsure(true):
     np.testing.assert_allclose(offset, 0, atol=1e-9)
     assert np.all(std > 1.0)
     np.testing.assert_allclose(confidence, 0.02)
+
+
+def points_of(true):
+    return module.landmark_points(true.vertices, true.tips, made.LAYOUT)
+
+
+def test_samples_say_where_the_landmark_is_in_the_valves_axes(shape, true):
+    for which in (0, 5, 10, 11):
+        x, y = module.landmark_samples(made.labelled(true, shape, which), which, 40)
+        points, rotation, _, _ = made.seen(x)
+        aim = points + np.einsum("pij,pj->pi", rotation, y)
+        np.testing.assert_allclose(aim, np.tile(points_of(true)[which], (40, 1)), atol=1e-9)
+        assert 2.0 < np.linalg.norm(y, axis=1).mean() < 15.0
+
+
+def test_samples_are_rated_by_their_distance_from_the_true_leaflet(shape, other):
+    x, y = module.boundary_samples(made.labelled(other, shape), 720)
+    assert y.shape == (len(x), 1)
+    assert y.min() >= 0
+    assert y.max() <= 1
+    gap = np.linalg.norm(made.seen(x)[0][:, None] - other.vertices, axis=2).min(axis=1)
+    # Far from every vertex is off the leaflet; about half of all places are near it.
+    assert y[gap > 6.0].mean() < 0.15
+    assert y[gap < 0.5].mean() > 0.6
+    assert 0.28 < np.mean(y > 0.3) < 0.5
