@@ -110,7 +110,7 @@ def test_an_interruption_leaves_no_entry_and_lets_the_next_one_in(tmp_path):
     }  # fmt: skip
 
 
-def test_of_several_entries_the_missing_ones_are_made_together_and_each_kept_as_it_comes(tmp_path):
+def test_missing_entries_are_made_together_and_each_is_stored_at_once(tmp_path):
     entries = [Entry(tmp_path / str(k), read) for k in range(4)]
     entries[1].keep("old", write)
     asked = []

@@ -1,4 +1,4 @@
-"""The rules that keep the project a house: who may import whom, and what a tracked file may say.
+"""Import directions between packages, declared dependencies, and what tracked files may contain.
 
 Imports are read from the source, so that one inside a function or for type checking counts as well.
 """

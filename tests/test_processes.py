@@ -1,4 +1,4 @@
-"""Programs end with whoever started them, with all that they have started, and tell how."""
+"""Programs end with the process that started them, with all their children."""
 
 import ast
 import os
@@ -53,7 +53,7 @@ def test_one_module_starts_all_processes():
     ("code", "status"),
     [("exit 7", 7), ("kill -SEGV $$", -11), ("kill -KILL $$", -9), ("kill -PIPE $$", -13)],
 )
-def test_the_end_of_a_program_is_told_as_it_was(code, status):
+def test_the_exit_status_of_a_program_is_passed_on(code, status):
     assert run(["/bin/sh", "-c", code], stderr=subprocess.DEVNULL).returncode == status
 
 

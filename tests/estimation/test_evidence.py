@@ -1,4 +1,4 @@
-"""Noise that is learned with the parameters: exactness, and what it makes of wrong assumptions."""
+"""Noise that is learned with the parameters: exact evidence, and robustness to wrong priors."""
 
 from __future__ import annotations
 

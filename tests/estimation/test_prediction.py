@@ -1,4 +1,4 @@
-"""What a model may return, and the error where it returns something else."""
+"""What a model may return, and the error if it returns something else."""
 
 import numpy as np
 import pytest

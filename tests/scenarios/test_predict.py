@@ -120,7 +120,7 @@ def test_samples_are_spread_as_the_posterior_where_all_is_linear(linear):
     assert linear.starts == ["closed at the estimate"] * 512
 
 
-def test_failed_samples_are_told_and_not_dropped(linear):
+def test_failed_samples_are_counted_and_not_dropped(linear):
     estimate = estimated()
     samples = posterior_samples(estimate, 16, 3)
     order = np.sort(samples[:, 0])

@@ -1,4 +1,4 @@
-"""Designs of a patient's frames and pressures: what is recorded, and what readers see of it."""
+"""Designs of a patient's frames and pressures: expected intervals, and estimates for some."""
 
 from dataclasses import replace
 

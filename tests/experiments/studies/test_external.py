@@ -32,7 +32,7 @@ def run(run, tmp_path):
         "external.noise_mm": str(NOISE),
         "external.units": "[N/mm,N/mm]",
         "external.observation": "observed.csv",
-        "external.folder": "kept",
+        "external.folder": "cached",
         "tracking.enabled": "false",
         "hydra.run.dir": "here",
     }
@@ -60,7 +60,7 @@ def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
     assert [row["unit"] for row in rows] == ["N/mm", "N/mm"]
     runs = rows[0]["runs"]
     assert runs == 5 * record.forward_solves
-    # The runs are kept: the same study again starts no program.
+    # The runs are cached: the same study again starts no program.
     status, _out, err = run()
     record = read_record(tmp_path / "here" / "result.json")
     (row, _) = record.table_of().rows
@@ -106,7 +106,7 @@ def test_a_program_that_fails_is_recorded_with_its_words(run, tmp_path):
         ([], {"external.differences": "exact"}, "central, forward"),
     ],
 )
-def test_a_wrong_request_is_told_in_one_line(run, without, changed, message):
+def test_a_wrong_request_is_refused_in_one_line(run, without, changed, message):
     status, _, err = run(*without, **changed)
     assert status == 2
     assert message in err

@@ -1,4 +1,4 @@
-"""The gate and a closure step by step, and what other studies read of the gate's records."""
+"""The gate and closure studies, and the verdicts that other studies look up."""
 
 import json
 
@@ -77,7 +77,7 @@ def test_a_verdict_is_looked_up_by_the_anatomy_and_not_by_its_name(tmp_path):
     assert gate_of(settings("template"), tmp_path / "none") == NOT_GATED
 
 
-def test_kept_verdicts_are_of_the_anatomies_as_they_ship():
+def test_published_verdicts_are_of_the_anatomies_that_ship():
     results = records_of(GATE_RECORDS.parent.parent, "gate")
     assert {record.row for record in results.records.values()} == set(ANATOMIES)
     for record in results.records.values():

@@ -1,4 +1,4 @@
-"""Virtual patients in volumes: what is put together of three estimations, and what is kept."""
+"""Virtual patients in volumes: one record of three estimations."""
 
 import json
 from types import SimpleNamespace
@@ -80,7 +80,7 @@ def test_estimates_from_the_volume_and_from_better_geometries_stand_together(est
     assert result.table_of("chordae").values["ratio"] == [1.01, 0.99, 0.96]
 
 
-def test_a_volume_that_is_lost_keeps_what_is_known_of_the_geometry(estimated):
+def test_a_failed_volume_keeps_estimates_from_better_geometries(estimated):
     result = estimated("no result: MemoryError", a_result(5.8, 2.1), a_result(5.4, 2.2, "failed"))
     (estimate,) = result.estimates
     assert (result.status, result.reason) == ("failed", "no result: MemoryError")

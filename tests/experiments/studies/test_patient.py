@@ -1,4 +1,4 @@
-"""Virtual patients: hidden before the estimation, revealed after it."""
+"""Virtual patients: blind estimates, compared with the truth afterwards."""
 
 import json
 

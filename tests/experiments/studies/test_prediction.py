@@ -1,7 +1,6 @@
 """The prediction study on a valve that stretches instead of closing: record, tables and failures.
 
-In place of the mechanics there is a stretch that is known in closed form; that valves close under
-scenarios is checked in tests/prediction.
+A stretch known in closed form replaces the mechanics; tests/scenarios checks real closures.
 """
 
 from types import SimpleNamespace

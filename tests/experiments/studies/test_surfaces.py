@@ -1,4 +1,4 @@
-"""Moduli from surfaces as they arrive: exports, imports, and what is said of the estimates."""
+"""Moduli from imported surfaces: geometry of each import, and estimates blind to the truth."""
 
 import json
 from dataclasses import replace

@@ -1,6 +1,6 @@
-"""A frame as detectors see it: ranks that grey maps leave alone, and places that stay places.
+"""Frames as detectors see them: ranks do not depend on grey levels, resampling keeps positions.
 
-Features where a hypothesis lies: interpolation against a ramp that is known everywhere.
+Features are interpolated at a hypothesis; a ramp, which is known everywhere, tests them.
 """
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The model's file: it comes back as it was, and a wrong one is refused in one line."""
+"""The detection model's file: round trip, and refusal of damaged files."""
 
 import hashlib
 import json

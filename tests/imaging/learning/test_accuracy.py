@@ -1,4 +1,4 @@
-"""Errors that detectors tell: their size, how far they are alike, and what is refused."""
+"""Stated errors of detectors: size, correlation length, and widening at low confidence."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Trees: what they learn, that they say what LightGBM says, and that no bad text is taken."""
+"""Boosted trees: what they learn, agreement with LightGBM, refusal of malformed text."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-""""""
+"""Simulated volumes: bright leaflets at the true positions, beats, tissue, scan conversion."""
 
 from dataclasses import replace
 
