@@ -69,6 +69,7 @@ def changed(place: Path) -> dict[str, int]:
     return {str(p.relative_to(root)): p.stat().st_ino for p in root.rglob("*.npz")}
 
 
+@pytest.mark.slow
 def test_the_study_says_how_far_detectors_are_off(done: Path):
     record = record_of(done)
     assert (record.status, record.reason) == ("converged", "trained and tested")
@@ -84,6 +85,7 @@ def test_the_study_says_how_far_detectors_are_off(done: Path):
         assert min(row["rms_handed_on"], row["stated_handed_on"]) > 0
 
 
+@pytest.mark.slow
 def test_what_is_tested_on_was_not_trained_on(done: Path):
     record, trained = record_of(done), load_model(done / "run" / "tee.npz").trained_on
     trials = record.table_of("trials").rows
@@ -96,6 +98,7 @@ def test_what_is_tested_on_was_not_trained_on(done: Path):
     assert len(set.union(*groups)) == sum(map(len, groups))
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_goes_on_where_it_was(done: Path):
     again, before = done / "again", record_of(done)
     store = changed(done)
@@ -113,6 +116,7 @@ def test_an_interrupted_study_goes_on_where_it_was(done: Path):
     assert after.numbers == before.numbers
 
 
+@pytest.mark.slow
 def test_given_detectors_are_tested_and_none_is_trained(done: Path, capsys):
     before, first = changed(done), load_model(done / "run" / "tee.npz")
     # The measured accuracy of detectors does not affect detection, so their trials are cached.
