@@ -1,4 +1,4 @@
-"""What lives in a folder, for tests of what is left behind."""
+"""Finds processes that work in a folder, to test that none is left behind."""
 
 import os
 import time

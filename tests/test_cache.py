@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import pytest
 
 from experiments.common.building import closure
 from mvest.cache import Entry, code_digest, content_digest, get_or_make, source_key
-from mvest.errors import InputError, MeshingError
+from mvest.errors import InputError
 from mvest.simulation.population import draw_population
 
 
@@ -66,19 +65,11 @@ def other_numbers(entry):
     write(entry.path, "b")
 
 
-def no_digest(entry):
-    (entry.path.parent / ".entry.sha256").unlink()
-
-
 def taken_from_another(entry):
     other = Entry(entry.path.with_name("other"), read)
     other.keep("b", write)
     other.path.replace(entry.path)
     entry.path.with_name(".other.sha256").replace(entry.path.with_name(".entry.sha256"))
-
-
-def one_more_file(entry):
-    (entry.path / "more").touch()
 
 
 @pytest.mark.parametrize(
@@ -87,9 +78,7 @@ def one_more_file(entry):
         (write, unreadable),
         (write_folder, unreadable),
         (write, other_numbers),
-        (write, no_digest),
         (write, taken_from_another),
-        (write_folder, one_more_file),
     ],
 )
 def test_an_entry_that_is_not_as_it_was_written_is_made_again(tmp_path, how, harm, capsys):
@@ -102,18 +91,6 @@ def test_an_entry_that_is_not_as_it_was_written_is_made_again(tmp_path, how, har
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f"note: {entry.path} is damaged and is made again"
     assert entry.found() == "a"
-
-
-def test_a_damaged_entry_that_cannot_be_reproduced_is_refused(tmp_path):
-    def refuse(path):
-        raise MeshingError(f"{path} is damaged")
-
-    (tmp_path / "entry").touch()
-    entry = Entry(tmp_path / "entry", refuse, remake=False)
-    make = made("a")
-    with pytest.raises(MeshingError, match="is damaged"):
-        entry.get_or_make(make, write)
-    assert make.calls == 0
 
 
 def test_an_interruption_leaves_no_entry_and_lets_the_next_one_in(tmp_path):
@@ -133,7 +110,7 @@ def test_an_interruption_leaves_no_entry_and_lets_the_next_one_in(tmp_path):
     }  # fmt: skip
 
 
-def test_of_several_entries_the_missing_ones_are_made_together_and_each_kept_as_it_comes(tmp_path):
+def test_missing_entries_are_made_together_and_each_is_stored_at_once(tmp_path):
     entries = [Entry(tmp_path / str(k), read) for k in range(4)]
     entries[1].keep("old", write)
     asked = []
@@ -152,36 +129,6 @@ def test_of_several_entries_the_missing_ones_are_made_together_and_each_kept_as_
         0, "old", 2, 30,
     ]  # fmt: skip
     assert asked == [[0, 2, 3]]
-    # With nothing to make, nothing is asked.
-    get_or_make(entries, lambda missing: pytest.fail("asked"), write)
-    with pytest.raises(ValueError, match="shorter"):
-        get_or_make([Entry(tmp_path / name, read) for name in "ab"], lambda _: [1], write)
-
-
-def test_of_several_that_need_the_same_entries_one_makes_them_and_no_two_wait_for_each_other(
-    tmp_path,
-):
-    # Locks of threads exclude each other as those of processes do: each opens the file anew.
-    begun, calls = threading.Barrier(4), []
-
-    def make(missing):
-        for k in missing:
-            calls.append(k)
-            time.sleep(0.02)
-            yield k
-
-    def use(turn):
-        entries = [Entry(tmp_path / str(k), read) for k in (range(3), reversed(range(3)))[turn]]
-        begun.wait()
-        get_or_make(entries, make, write)
-
-    threads = [threading.Thread(target=use, args=(k % 2,), daemon=True) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(20)
-        assert not thread.is_alive()
-    assert len(calls) == 3
 
 
 MAKER = """
@@ -221,12 +168,6 @@ def test_after_a_process_was_killed_while_it_wrote_one_of_those_that_wait_makes_
     assert {path.name for path in tmp_path.iterdir()} == {
         "entry", ".entry.lock", ".entry.sha256", "killed writes", f"{said.pop()} writes",
     }  # fmt: skip
-
-
-def test_an_unwritable_store_is_one_line_of_the_family(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match=r"^cannot write .*entry: "):
-        Entry(tmp_path / "file" / "entry", read).get_or_make(made("a"), write)
 
 
 # -- keys of code ---------------------------------------------------------------------------------

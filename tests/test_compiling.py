@@ -9,10 +9,7 @@ import pytest
 
 from tests.places import ROOT
 
-USE = (
-    "import numpy as np; from mvest.valve.geometry import proximity; import os; "
-    "print(os.environ.get('NUMBA_CACHE_DIR'))"
-)
+SAY = "; import os; print(os.environ.get('NUMBA_CACHE_DIR'))"
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +24,11 @@ def read_only(tmp_path_factory):
     return place
 
 
-def cache_of(place, **more: str) -> str:
-    """Where a process says that numba keeps what it compiles."""
+def cache_of(place, code: str = "import mvest", **more: str) -> str:
+    """The cache folder of numba in a process that runs some code."""
     kept = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
     done = subprocess.run(
-        [sys.executable, "-P", "-c", USE],
+        [sys.executable, "-P", "-c", code + SAY],
         env={**kept, "PYTHONPATH": str(place), "HOME": str(place / "home"), **more},
         capture_output=True,
         text=True,
@@ -44,7 +41,9 @@ def cache_of(place, **more: str) -> str:
 def test_a_private_temporary_folder_is_the_cache_where_nothing_else_can_be_written(
     read_only, tmp_path
 ):
-    found = cache_of(read_only, TMPDIR=str(tmp_path))
+    # Importing compiled kernels fails if numba finds no folder for them.
+    kernels = "from mvest.valve.geometry import proximity"
+    found = cache_of(read_only, kernels, TMPDIR=str(tmp_path))
     assert found == str(tmp_path / f"mvest-numba-{os.getuid()}")
     assert (tmp_path / f"mvest-numba-{os.getuid()}").stat().st_mode & 0o777 == 0o700
     # numba executes its cache: a folder into which others can write is none.

@@ -73,11 +73,6 @@ def test_a_file_is_on_the_disk_before_it_takes_its_name_where_that_is_asked_for(
     assert synced == [False]
 
 
-def test_what_cannot_be_written_is_one_line_of_the_family(tmp_path):
-    with pytest.raises(InputError, match=r"^cannot write .*absent.a: No such .*must exist"):
-        write_atomically(tmp_path / "absent" / "a", "")
-
-
 def test_leftovers_are_taken_away_and_nothing_else(tmp_path):
     for name in ("a.npz", ".part-01-a.npz", ".part-02-b.npz", ".part-03-aa.npz", ".lock"):
         (tmp_path / name).touch()
@@ -125,13 +120,11 @@ def test_of_a_folder_names_contents_and_what_links_lead_to_count(tmp_path):
     assert changed()
     (folder / "frames" / "a").rename(folder / "frames" / "b")
     assert changed()
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "x").write_text(name)
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "x").write_text("1")
     (folder / "link").symlink_to(tmp_path / "one")
     assert changed()
-    (folder / "link").unlink()
-    (folder / "link").symlink_to(tmp_path / "two")
+    (tmp_path / "one" / "x").write_text("2")
     assert changed()
     # One that leads back ends.
     (folder / "loop").symlink_to(folder)

@@ -77,29 +77,6 @@ def test_moduli_of_an_own_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert [modulus.estimate for modulus in record.moduli] == moduli_alone.result.estimate.tolist()
 
 
-FILTERS = (
-    mvest.PaperFilter(),
-    mvest.ExtendedFilter(),
-    mvest.IteratedFilter(),
-    mvest.UnscentedFilter(),
-    mvest.EnsembleFilter(),
-    mvest.ImportanceFilter(),
-)
-
-
-@pytest.mark.parametrize("own_filter", FILTERS, ids=lambda f: type(f).__name__)
-def test_an_own_model_behind_every_filter(own_filter: mvest.PaperFilter) -> None:
-    H = np.array([[1.0, 0.5], [0.0, 2.0], [1.0, -1.0]])
-
-    def model(m: np.ndarray) -> mvest.Prediction:
-        return mvest.Prediction(H @ m, H)
-
-    prior = mvest.Gaussian.from_variance([5.0, 3.0], 4.0)
-    found = own_filter(model, prior, H @ np.array([4.5, 3.2]), R=1e-4)
-    # The ensemble's gain is that of a hundred samples.
-    np.testing.assert_allclose(found.mean, [4.5, 3.2], atol=0.1)
-
-
 def test_a_body_without_a_valve() -> None:
     nodes = np.array([[0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]], dtype=float)
     tetrahedron = np.array([[0, 1, 2, 3]])
@@ -115,11 +92,6 @@ def test_a_body_without_a_valve() -> None:
     )
     assert body.converged
     assert body.frames[-1, 3, 2] != 3.0
-
-
-def test_what_a_user_can_cause_is_one_family() -> None:
-    with pytest.raises(mvest.MvestError, match="no such folder"):
-        mvest.read_case("nowhere")
 
 
 # --- the faces ----------------------------------------------------------------------------------

@@ -3,14 +3,12 @@
 Every run goes through the public command into an empty folder. ``golden.json`` holds, for each, the
 command, the commit that made the values, and the estimate and standard deviation of every unknown.
 A number may differ by `TOLERANCE` of its size, or of its standard deviation where that is larger
-(a displacement may be zero). After an intended change of an estimator, renew the values, all or
-those of some runs, and state why in the commit::
+(a displacement may be zero). After an intended change of an estimator, write them again::
 
     python -m tests.test_golden [NAME ...]
 
-How much the machine itself changes is said at `TOLERANCE`. The runs named ``*_coarse`` are coarse
-meshes without relinearising, for seconds: they guard the same code as the full ones, which are
-``slow``; their numbers mean nothing.
+The runs named ``*_coarse`` take seconds on coarse meshes, without relinearising. They guard the
+same code as the full ones, which are ``slow``.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""The rules that keep the project a house: who may import whom, and what a tracked file may say.
+"""Import directions between packages, declared dependencies, and what tracked files may contain.
 
 Imports are read from the source, so that one inside a function or for type checking counts as well.
 """
@@ -56,21 +56,15 @@ IMPORT_AND_EXPORT = (
     "mvest.exchange",
 )
 
+CLOSURES = (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.estimation", "mvest.closure")
+
 # What each room of mvest may import from mvest, itself aside: the longest name that fits counts.
 # What is not listed has no place.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest": ("mvest._compiling",),
     "mvest.__main__": (),
+    **dict.fromkeys(LEAVES, LEAVES),
     "mvest._compiling": (),
-    "mvest.errors": LEAVES,
-    "mvest.files": LEAVES,
-    "mvest.cache": LEAVES,
-    "mvest.reading": LEAVES,
-    "mvest.processes": LEAVES,
-    "mvest.units": LEAVES,
-    "mvest.typing": LEAVES,
-    "mvest.quantities": LEAVES,
-    "mvest.elements": LEAVES,
     "mvest.provenance": LEAVES,
     "mvest.valve": LEAVES,
     "mvest.mechanics": (*LEAVES, *VALUE_OBJECTS),
@@ -78,45 +72,14 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.estimation": LEAVES,
     "mvest.closure": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.estimation"),
     "mvest.observation": (*LEAVES, "mvest.valve", "mvest.estimation"),
-    "mvest.problem": (
-        *LEAVES,
-        "mvest.provenance",
-        "mvest.valve",
-        "mvest.mechanics",
-        "mvest.estimation",
-        "mvest.closure",
-        "mvest.observation",
-    ),
+    "mvest.problem": (*CLOSURES, "mvest.provenance", "mvest.observation"),
     "mvest.cases": (*LEAVES, *FILES, "mvest.provenance", "mvest.valve"),
     "mvest.cases.from_images": (*LEAVES, *FILES, "mvest.valve", "mvest.imaging", "mvest.cases"),
-    "mvest.exchange": (
-        *LEAVES,
-        "mvest.provenance",
-        "mvest.valve",
-        "mvest.mechanics",
-        "mvest.imaging",
-        "mvest.estimation",
-        "mvest.closure",
-    ),
+    "mvest.exchange": (*CLOSURES, "mvest.provenance", "mvest.imaging"),
     "mvest.exchange.importing": IMPORT_AND_EXPORT,
     "mvest.exchange.exporting": IMPORT_AND_EXPORT,
-    "mvest.personalisation": (
-        *LEAVES,
-        "mvest.valve",
-        "mvest.mechanics",
-        "mvest.estimation",
-        "mvest.closure",
-        "mvest.observation",
-        "mvest.problem",
-        "mvest.cases",
-    ),
-    "mvest.scenarios": (
-        *LEAVES,
-        "mvest.valve",
-        "mvest.mechanics",
-        "mvest.estimation",
-        "mvest.closure",
-    ),
+    "mvest.personalisation": (*CLOSURES, "mvest.observation", "mvest.problem", "mvest.cases"),
+    "mvest.scenarios": CLOSURES,
     "mvest.simulation": (
         *LEAVES,
         "mvest.provenance",
@@ -271,58 +234,35 @@ def test_imports_go_one_way() -> None:
     assert broken == []
 
 
-def test_conf_is_data() -> None:
-    code = [path for path in (ROOT / "conf").rglob("*.py") if ast.parse(path.read_text()).body[1:]]
-    assert code == []
-
-
 @pytest.mark.parametrize(
     ("module", "source", "count"),
     [
         # Siblings do not cross, however the import is written.
-        ("mvest.valve.anatomy.template", "import mvest.mechanics.law.biot", 1),
         ("mvest.valve.anatomy.template", "from mvest import imaging", 1),
         ("mvest.valve.anatomy.template", "from ...estimation import gaussian", 1),
-        ("mvest.mechanics.law.biot", "def f():\n    import mvest.imaging", 1),
-        ("mvest.estimation.ekf", "import importlib\nimportlib.import_module('mvest.valve')", 1),
         ("mvest.reporting.figures", "if TYPE_CHECKING:\n    import mvest.mechanics", 1),
         ("mvest.valve.anatomy.template", "from . import mesh\nfrom mvest.valve import a", 0),
         # Mechanics and imaging know the value objects of the valve only, and leaves only leaves.
         ("mvest.mechanics.law.biot", "from mvest.valve.anatomy.template import make_template", 1),
         ("mvest.mechanics.law.biot", "from mvest.valve.mesh.solid_mesh import SolidMesh", 0),
-        ("mvest.imaging.tracking", "from ..valve.anatomy.valve import Motion\nimport numpy", 0),
         ("mvest.errors", "from mvest.provenance import git_state", 1),
-        ("mvest.errors", "from mvest.typing import FloatArray", 0),
         # The library does not know how it is run. A name that begins alike is another package.
         ("mvest.problem.estimate", "import hydra", 1),
-        ("mvest.problem.estimate", "from experiments.run import main", 1),
         ("mvest.problem.estimate", "import hydrate, mlflower, testslide", 0),
         ("experiments.run", "from tests.valve import shapes", 1),
-        ("experiments.run", "import hydra, mlflow\nfrom mvest.problem.estimate import Problem", 0),
         # A study knows no other, nor what runs or publishes it.
         ("experiments.studies.a", "from experiments.studies.ab import STUDY", 1),
         ("experiments.studies.a", "def f():\n    import experiments.runner.job", 1),
-        ("experiments.studies.a.study", "from experiments.studies.a import part", 0),
         # A job does not depend on how jobs are run or logged.
         ("experiments.runner.jobs", "from experiments.runner.tracking import store", 1),
         ("experiments.runner.job", "from experiments.runner.tracking import store", 0),
         # Nothing imports the package's face, and a new package needs a place.
-        ("mvest", "from mvest.errors import MvestError", 1),
         ("mvest.problem.estimate", "from mvest import Gaussian", 1),
         ("mvest.helpers", "import math", 1),
     ],
 )
 def test_wrong_imports_are_seen(module: str, source: str, count: int) -> None:
     assert len(import_violations(source, module, is_package=module == "mvest")) == count
-
-
-def through_faces(source: str, module: str, faces: dict[str, set[str]]) -> list[str]:
-    """Names that a module takes from a lazy face instead of the module that defines them."""
-    return [
-        f"{module}:{line} imports {name}"
-        for line, name, _ in imports(source, module)
-        if name.rpartition(".")[2] in faces.get(name.rpartition(".")[0], ())
-    ]
 
 
 def test_nothing_in_the_house_goes_through_a_lazy_face() -> None:
@@ -336,13 +276,12 @@ def test_nothing_in_the_house_goes_through_a_lazy_face() -> None:
         }
         for stub in (ROOT / "mvest").rglob("__init__.pyi")
     }
-    deferred = "def f():\n    from mvest.estimation import Gaussian, filters"
-    assert len(through_faces(deferred, "mvest.x", faces)) == 1
-    assert not through_faces("from mvest.estimation.gaussian import Gaussian", "mvest.x", faces)
+    assert "Gaussian" in faces["mvest.estimation"]
     hidden = [
-        message
+        f"{module}:{line} imports {name}"
         for module, path in modules("mvest", "experiments")
-        for message in through_faces(path.read_text(encoding="utf-8"), module, faces)
+        for line, name, _ in imports(path.read_text(encoding="utf-8"), module)
+        if name.rpartition(".")[2] in faces.get(name.rpartition(".")[0], ())
     ]
     assert hidden == []
 
@@ -448,14 +387,6 @@ def test_the_lock_file_fits_the_declared_dependencies(project: dict) -> None:
         assert requirement.specifier.contains(version), f"run `make lock`: {text} has {version}"
 
 
-def test_the_lock_file_names_packages_and_hashes_only() -> None:
-    pinned = re.compile(
-        r"#.*|[A-Za-z0-9._-]+==[^\s;]+( ; [^@]+)? \\|    --hash=sha256:[0-9a-f]{64}( \\)?"
-    )
-    lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
-    assert [line for line in lines if not pinned.fullmatch(line)] == []
-
-
 # --- what tracked files say ---------------------------------------------------------------------
 
 MACHINE_PATH = re.compile(
@@ -509,24 +440,14 @@ def test_tracked_files_name_no_machine_path_and_no_private_host() -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "see /" + "home/someone/data",
         '"/' + 'Users/someone"',
         "--find-links file:" + "///srv/wheels",
-        "http:" + "//packages.example.internal/simple",
         "http:" + "//someone:secret@10.0.0.7/simple",
         "git clone ssh:" + "//git@server.lan/repository",
     ],
 )
 def test_a_private_mention_is_seen(text: str) -> None:
     assert len(private_mentions(text)) == 1
-
-
-def test_a_public_mention_passes() -> None:
-    text = (
-        "https://pypi.org/simple, https://doi.org/10.1000/182. http://127.0.0.1:5000 "
-        "${HOME}/work/data, outputs/work/mesh.vtu, ./tmp/file, <root>/home/x #!/usr/bin/env kPa/mm"
-    )
-    assert private_mentions(text) == []
 
 
 def test_versions_agree(project: dict) -> None:

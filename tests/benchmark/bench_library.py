@@ -1,7 +1,6 @@
 """Kernels at the closed state, closures, updates of the filter, a batch, and Table 1."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,18 +95,14 @@ def test_guided_closure(case, measure):
     np.testing.assert_allclose(result.simulation.frames[-1], c.x, atol=1e-6)
 
 
-@pytest.mark.parametrize("how", ["continued", "anchored"])
-def test_farther_closure(case, measure, tmp_path, how):
+def test_farther_closure(case, measure):
     c, about = case
-    valve = replace(c.model.fresh(), continuation=True)
-    valve = valve if how == "anchored" else c.model.fresh()
-    m = farther(about["size"])
-    # The first closure builds the mechanics, and makes the anchor.
-    assert valve.close(m if how == "anchored" else VALUES).simulation.converged
-    valve.continuation, start = True, None if how == "anchored" else valve.closed
+    valve, m = c.model.fresh(), farther(about["size"])
+    assert valve.close(VALUES).simulation.converged
+    valve.continuation, start = True, valve.closed
     about = about | {"rounds": 3, "warmup": 0, "parameters": 2, "peak_mb": c.peak_mb}
     result = measure(
-        f"{how} closure", lambda: valve.close(m), setup=lambda: valve.restart(start), **about
+        "continued closure", lambda: valve.close(m), setup=lambda: valve.restart(start), **about
     )
     assert result.simulation.converged
     assert len(result.simulation.times) == 2

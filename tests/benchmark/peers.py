@@ -78,26 +78,13 @@ class Solved(NamedTuple):
 class Candidate(NamedTuple):
     """A library with the sheet set up, ready to be solved again and again."""
 
-    library: str
     version: str
     note: str
     solve: Callable[[], Solved]
 
 
 class Sheet:
-    """The mesh that all libraries share.
-
-    Attributes
-    ----------
-    nodes, elements : ndarray
-        ``(n, 3)`` mm and ``(m, 4)``.
-    under : ndarray
-        ``(f, 3)`` faces underneath, normals downwards.
-    clamped : ndarray
-        Nodes of the four sides.
-    centre : int
-        Node in the middle of the underside.
-    """
+    """The mesh that all libraries share: ``(n, 3)`` nodes in mm and ``(m, 4)`` elements."""
 
     def __init__(self, cells: tuple[int, int, int]) -> None:
         self.nodes, self.elements = box("tet4", cells, SIZE)
@@ -112,10 +99,11 @@ class Sheet:
 class SaintVenantKirchhoff:
     """The law ``S = C E`` with constant isotropic moduli, for one region."""
 
+    kinds: tuple[str, ...] = ()
+
     def __init__(self) -> None:
         self.moduli = np.diag([2 * MU] * 3 + [MU] * 3)
         self.moduli[:3, :3] += LAMBDA
-        self.tangent = np.zeros((0, 1, 6, 6))
 
     def strain(self, green: FloatArray) -> FloatArray:
         """The Green-Lagrange strain itself; nothing is damped."""
@@ -123,76 +111,50 @@ class SaintVenantKirchhoff:
 
     def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
         """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``."""
-        green = at.green
-        stress = (green.reshape(-1, 6) @ self.moduli).reshape(green.shape)
-        if self.tangent.shape[:2] != green.shape[:2]:
-            self.tangent = np.tile(self.moduli, (*green.shape[:2], 1, 1))
-        return stress, self.tangent
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Nothing is differentiated."""
-        return ()
+        stress = (at.green.reshape(-1, 6) @ self.moduli).reshape(at.green.shape)
+        return stress, np.tile(self.moduli, (*at.green.shape[:2], 1, 1))
 
 
-class Mvest:
+def own_body(sheet: Sheet) -> tuple[System, Loads]:
     """The sheet in mvest."""
+    region = np.zeros(len(sheet.elements), dtype=np.int64)
+    fibre = np.broadcast_to([1.0, 0.0, 0.0], sheet.nodes.shape).copy()
+    mesh = SolidMesh(
+        sheet.nodes, sheet.elements, "tet4", region, ("sheet",), fibre, sheet.under
+    )  # fmt: skip
+    load = PressureLoad(mesh.pressure_faces, mesh.reference.face)
+    system = System(Solid(mesh, SaintVenantKirchhoff()), pressure=load, fixed_nodes=sheet.clamped)
+    return system, Loads(pressure=PRESSURE, fixed=sheet.nodes[sheet.clamped])
 
-    def __init__(self, sheet: Sheet) -> None:
-        mesh = SolidMesh(
-            sheet.nodes,
-            sheet.elements,
-            "tet4",
-            np.zeros(len(sheet.elements), dtype=np.int64),
-            ("sheet",),
-            np.broadcast_to([1.0, 0.0, 0.0], sheet.nodes.shape).copy(),
-            sheet.under,
-        )
-        self.system = System(
-            Solid(mesh, SaintVenantKirchhoff()),
-            pressure=PressureLoad(mesh.pressure_faces, mesh.reference.face),
-            fixed_nodes=sheet.clamped,
-        )
-        self.loads = Loads(pressure=PRESSURE, fixed=sheet.nodes[sheet.clamped])
 
-    def simulate(self) -> Simulation:
-        """One static step, with a solver that has not seen the matrix before."""
-        result = simulate(
-            self.system,
-            lambda _: self.loads,
-            [Step(1.0, static=True)],
-            newton=NewtonSettings(tolerance=TOLERANCE, max_iterations=MAX_ITERATIONS),
-            solver=linear_solver(),
-        )
-        if not result.converged:
-            raise RuntimeError(f"mvest: {result.reason.value}")
-        return result
+def inflated(system: System, loads: Loads) -> Simulation:
+    """One static step, with a solver that has not seen the matrix before."""
+    newton = NewtonSettings(tolerance=TOLERANCE, max_iterations=MAX_ITERATIONS)
+    steps = [Step(1.0, static=True)]
+    result = simulate(system, lambda _: loads, steps, newton=newton, solver=linear_solver())
+    if not result.converged:
+        raise RuntimeError(f"mvest: {result.reason.value}")
+    return result
 
 
 def with_mvest(sheet: Sheet) -> Candidate:
     """The sheet in mvest."""
-    body = Mvest(sheet)
+    body = own_body(sheet)
 
     def solve() -> Solved:
-        result = body.simulate()
+        result = inflated(*body)
         return Solved(result.iterations, float(result.frames[-1, sheet.centre, 2]))
 
-    return Candidate("mvest", mvest.__version__, f"solver {linear_solver().name}", solve)
+    return Candidate(mvest.__version__, f"solver {linear_solver().name}", solve)
 
 
 def factor_alone(sheet: Sheet) -> Candidate:
     """Factorising and solving mvest's tangent of the inflated sheet, analysed beforehand."""
-    body = Mvest(sheet)
-    state = body.system.evaluate(
-        body.simulate().frames[-1],
-        body.loads,
-        None,
-        body.system.solid.initial_strain(),
-        0.0,
-        tangent=True,
-    )
+    system, loads = own_body(sheet)
+    x, strain = inflated(system, loads).frames[-1], system.solid.initial_strain()
+    state = system.evaluate(x, loads, None, strain, 0.0, tangent=True)
     assert state.blocks is not None
-    matrix = body.system.matrix(state.blocks, 0.0)
+    matrix = system.matrix(state.blocks, 0.0)
     right = np.ones(matrix.shape[0])
     solver = linear_solver()
     solver.factorize(matrix)
@@ -203,7 +165,7 @@ def factor_alone(sheet: Sheet) -> Candidate:
         return Solved(1, None)
 
     version = metadata.version("mkl" if solver.name == "pardiso" else "scipy")
-    return Candidate("factor + solve alone", version, f"{solver.name}, mvest's tangent", solve)
+    return Candidate(version, f"{solver.name}, mvest's tangent", solve)
 
 
 def with_felupe(sheet: Sheet) -> Candidate:
@@ -261,7 +223,7 @@ def with_felupe(sheet: Sheet) -> Candidate:
         )
         return Solved(result.iterations, float(result.x[0].values[sheet.centre, 2]))
 
-    return Candidate("felupe", metadata.version("felupe"), "solver pypardiso.spsolve", solve)
+    return Candidate(metadata.version("felupe"), "solver pypardiso.spsolve", solve)
 
 
 def _felupe_underside(sheet: Sheet) -> Any:
@@ -288,31 +250,29 @@ def _felupe_underside(sheet: Sheet) -> Any:
 
 def measure(sheet: Sheet) -> list[Row]:
     """Rows of all libraries, mvest first."""
-    n = len(sheet.nodes)
-    candidates: list[Candidate] = []
+    candidates: dict[str, Candidate] = {}
     missing: list[Row] = []
     for name, prepare in PREPARE.items():
         try:
-            candidates.append(prepare(sheet))
+            candidates[name] = prepare(sheet)
         except ImportError as error:
-            missing.append({"library": name, "nodes": n, "note": f"not importable: {error}"})
-    seconds: list[list[float]] = [[] for _ in candidates]
-    solved: list[Solved] = []
+            missing.append({"library": name, "note": f"not importable: {error}"})
+    seconds: dict[str, list[float]] = {name: [] for name in candidates}
+    solved: dict[str, Solved] = {}
     for _ in range(REPEATS):
-        solved = []
-        for candidate, taken in zip(candidates, seconds, strict=True):
+        for name, candidate in candidates.items():
             start = time.process_time()
-            solved.append(candidate.solve())
-            taken.append((time.process_time() - start) / solved[-1].iterations)
-    expected = solved[0].deflection
+            solved[name] = candidate.solve()
+            seconds[name].append((time.process_time() - start) / solved[name].iterations)
+    expected = solved["mvest"].deflection
     rows: list[Row] = []
-    for own, taken, (iterations, moved) in zip(candidates, seconds, solved, strict=True):
+    for name, own in candidates.items():
+        moved = solved[name].deflection
         rows.append({
-            "library": own.library, "version": own.version, "nodes": n,
-            "seconds_per_iteration": float(np.median(taken[1:])), "iterations": iterations,
-            "deflection_mm": moved,
-            "difference": None if moved is None else abs(moved / expected - 1),
-            "note": own.note,
+            "library": name, "version": own.version, "nodes": len(sheet.nodes),
+            "seconds_per_iteration": float(np.median(seconds[name][1:])),
+            "iterations": solved[name].iterations, "deflection_mm": moved,
+            "difference": None if moved is None else abs(moved / expected - 1), "note": own.note,
         })  # fmt: skip
     return rows + missing
 

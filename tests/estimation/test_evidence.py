@@ -1,4 +1,4 @@
-"""Noise that is learned with the parameters: exactness, and what it makes of wrong assumptions."""
+"""Noise that is learned with the parameters: exact evidence, and robustness to wrong priors."""
 
 from __future__ import annotations
 
@@ -195,21 +195,6 @@ def test_intervals_hold_for_errors_other_than_stated(length: float, rough: float
         assert np.mean(nis) == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_belief_without_width_is_the_plain_filter() -> None:
-    held = Gaussian(FAMILY.bands.mean, np.zeros((BANDS, BANDS)))  # type: ignore[union-attr]
-    family = NoiseFamily(FAMILY.blocks, {"rough": LogNormal(0.2)}, held, 0.03)
-    y = B @ np.ones(8) + 0.5 * np.random.default_rng(2).standard_normal(family.size)
-    learned, plain = (
-        IteratedFilter(1e-8)(lambda m: Prediction(B @ m, B), UNIT[8], y, R)
-        for R in (family, family.stated())
-    )
-    np.testing.assert_allclose(learned.mean, plain.mean, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(learned.covariance, plain.covariance, rtol=1e-9)
-    assert learned.learned is not None
-    assert not np.any(learned.learned.covariance)
-    assert all(quantity.stretch == 0.0 for quantity in learned.learned.quantities)
-
-
 def test_a_filter_learns_the_noise_where_the_model_is_not_linear() -> None:
     def curved(m: FloatArray) -> Prediction:
         return Prediction(B @ (m + 0.05 * m**2), B * (1.0 + 0.1 * m))
@@ -244,10 +229,8 @@ def test_a_filter_learns_the_noise_where_the_model_is_not_linear() -> None:
     ("make", "message"),
     [
         (lambda: NoiseFamily(FAMILY.blocks, {}, FAMILY.bands), "rough; quantities .* for none"),
-        (lambda: NoiseFamily(FAMILY.blocks, {"rough": ROUGH}), "expected its bands"),
         (lambda: FAMILY.plus(ErrorColumns("rough", B[:, :1])), "different names"),
         (lambda: LogNormal(0.0), "median 0.0, expected > 0"),
-        (lambda: LogNormal(1.0, 0.5), "factor 0.5, expected >= 1"),
         (lambda: FAMILY.at(FAMILY.prior.mean, 0.5), "mean of 0.5 beats, expected >= 1"),
         (lambda: replace(FAMILY, resolution=0).at(FAMILY.prior.mean, np.inf), "no noise without"),
     ],

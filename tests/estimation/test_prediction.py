@@ -1,4 +1,4 @@
-"""What a model may return, and the error where it returns something else."""
+"""What a model may return, and the error if it returns something else."""
 
 import numpy as np
 import pytest
@@ -80,14 +80,6 @@ def test_another_return_is_one_line_that_says_what_is_expected(use: str) -> None
         with pytest.raises(InputError, match=words) as caught:
             USES[use](lambda m, r=returned: r)
         assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("use", ["IteratedFilter", "expectation", "some parameters"])
-def test_derivatives_by_other_parameters_are_refused(use: str) -> None:
-    with pytest.raises(InputError, match=r"2 parameters.*shape \(6, 3\)"):
-        USES[use](lambda m: (Y, np.ones((6, 3))))
-    with pytest.raises(InputError, match=r"derivatives.*shape \(6, 0\)"):
-        USES[use](lambda m: Prediction.undifferentiated(Y))
 
 
 def test_a_model_cannot_write_on_its_parameters_and_fails_by_a_material_error() -> None:

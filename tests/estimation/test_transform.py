@@ -10,7 +10,6 @@ from mvest.estimation import (
     Log,
     PaperFilter,
     Prediction,
-    Reason,
 )
 
 PRIOR = Gaussian(np.array([5.0]), np.array([[0.25]]))
@@ -59,15 +58,3 @@ def test_derivative_is_that_of_the_inverse(transform):
     difference = (transform.inverse(z + d) - transform.inverse(z - d)) / (2 * d)
     np.testing.assert_allclose(transform.derivative(z), difference, rtol=1e-9)
     np.testing.assert_allclose(transform.forward(transform.inverse(z)), z)
-
-
-def test_an_overflowing_step_is_a_value():
-    # exp of the first full step overflows; the paper's mode cannot go on, and says so.
-    def model(m):
-        return Prediction(np.log(m), 1e-3 * np.diag(1.0 / m))
-
-    prior = Gaussian(np.array([1.0]), np.array([[1e6]]))
-    estimate = PaperFilter(Q=1.0)(model, prior, np.array([5.0]), 1e-6, transform=Log())
-    assert estimate.reason is Reason.MODEL_FAILED
-    assert "not finite" in estimate.detail
-    assert estimate.forward_solves == 1

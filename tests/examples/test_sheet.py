@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
+from mvest.estimation import Gaussian, IteratedFilter, Log
 from mvest.exchange.external.contract import Command, RunRequest, read_answer, write_request
 from mvest.exchange.external.model import Differences, ProcessModel
 from tests.places import ROOT
@@ -91,17 +91,6 @@ def test_each_model_estimates_from_the_other_s_data():
         np.testing.assert_allclose(found.mean, M, rtol=1e-5)
 
 
-@pytest.mark.parametrize("model", [OwnSheet, SecondSheet])
-def test_inadmissible_moduli_are_a_reason(model):
-    for values in ([-1.0, 1.0], [0.0, 1.0], [np.inf, 1.0]):
-        prediction = model(TINY)(np.array(values))
-        assert not prediction.converged
-        assert "expected positive moduli" in prediction.reason
-    prior = Gaussian(np.array([-1.0, 1.5]), np.eye(2))
-    found = IteratedFilter()(model(TINY), prior, TINY.points.ravel(), 1.0)
-    assert found.reason is Reason.MODEL_FAILED
-
-
 @pytest.mark.parametrize(
     "change", [{"thickness": float("nan")}, {"poisson": 0.5}, {"cells": (3, 2)}, {"load_steps": 0}]
 )
@@ -112,34 +101,24 @@ def test_an_inadmissible_sheet_is_refused(change):
         SecondSheet(TINY, "hooke")
 
 
-def sheet_program(folder, **settings):
-    """The tiny sheet as a program."""
-    return ProcessModel(
+def test_the_program_predicts_what_the_library_predicts(tmp_path):
+    expected = SecondSheet(TINY)(M)
+    program = ProcessModel(
         Command((sys.executable, str(FILE), "{request}", "{folder}"), {}, 60.0),
-        folder,
+        tmp_path,
         PARAMETERS,
         len(TINY.points),
         units=("MPa", "MPa"),
-        settings={"cells": [2, 2], "observed": [4, 3], "load_steps": 2, **settings},
-        differences=Differences("central", 1e-3, processes=2),
+        settings={"cells": [2, 2], "observed": [4, 3], "load_steps": 2},
+        differences=Differences("central", 1e-3),
         reuse=False,
     )
-
-
-def test_the_program_predicts_what_the_library_predicts(tmp_path):
-    expected = SecondSheet(TINY)(M)
-    program = sheet_program(tmp_path)
     answer = program(M)
     assert answer.converged, answer.reason
     # Another process may add up in another order; files that lose digits would show at 1e-7.
     np.testing.assert_allclose(answer.y, expected.y, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(answer.jacobian, expected.jacobian, rtol=1e-10, atol=1e-12)
-    alone = sheet_program(tmp_path, derivatives=False)
-    found = alone(M)
-    assert (program.runs, alone.runs) == (1, 5)
-    # Central differences of a relative step s err by about s^2.
-    size = np.abs(expected.jacobian).max()
-    np.testing.assert_allclose(found.jacobian, expected.jacobian, atol=1e-5 * size)
+    assert program.runs == 1
 
 
 def test_the_program_passes_on_a_failure(tmp_path):

@@ -27,21 +27,6 @@ def test_vertices_and_triangles_are_those_of_the_template(columns, rows):
     np.testing.assert_array_equal(layout.region, surface.region)
 
 
-def test_vertices_are_found_by_angle_and_row():
-    for rim, s in ((LAYOUT.annulus, 0), (LAYOUT.free_edge, 1)):
-        assert np.all(LAYOUT.s[rim] == s)
-        np.testing.assert_allclose(LAYOUT.phi[rim], 22.5 * np.arange(16))
-    for phi, row in ((90.0, 3), (270.0, -1), (360.0, -1), (-90.0, 0)):
-        vertex = LAYOUT.vertex(phi, row)
-        assert LAYOUT.phi[vertex] == phi % 360
-        assert LAYOUT.s[vertex] == pytest.approx((row % 7) / 6)
-    with pytest.raises(InputError, match="at 10 degrees"):
-        LAYOUT.vertex(10.0, 0)
-    for columns, rows in ((4, 7), (18, 7), (16, 2)):
-        with pytest.raises(InputError, match="multiple of 4"):
-            ValveLayout(columns, rows)
-
-
 def test_points_are_located_where_phi_and_s_are_linear():
     rng = np.random.default_rng(3)
     phi = np.concatenate([rng.uniform(-400.0, 400.0, 200), [0.0, 360.0, 22.5, 359.999]])

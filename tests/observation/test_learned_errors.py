@@ -1,4 +1,4 @@
-"""What is believed of errors, as the noise of each kind of observation."""
+"""Priors of observation errors as the noise of each kind of observation."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ BELIEFS = ErrorBeliefs()
 
 
 def covariance(family: NoiseFamily) -> FloatArray:
-    """R as it is stated."""
+    """The stated R."""
     W = family.stated().whiten(np.eye(family.size))
     return np.asarray(np.linalg.inv(W.T @ W), dtype=np.float64)
 

@@ -79,9 +79,3 @@ def test_the_text_names_parameters_that_are_poorly_determined():
     labelled = trade_off_text(group, {"pressure_scale": "the pressure"})
     assert "of the pressure" in labelled
     assert "pressure_scale" not in labelled
-
-
-def test_a_fixed_parameter_has_no_width_and_a_failed_model_no_text():
-    assert expected(problem_of([3.0, 1.0, 0.0]))[1]["pressure_scale"][:6] == [1.0] * 6
-    failing = problem_of([3.0, 1.0, 0.1], lambda m: Prediction.failed("no equilibrium"))
-    assert "(no equilibrium)" in expected(failing)[0]

@@ -1,7 +1,6 @@
 import pytest
 from matplotlib.figure import Figure
 
-from mvest.errors import InputError
 from mvest.reporting.figures import iterates_figure, save_figure_with
 from tests.experiments.studies.made_up import made_up_estimate
 
@@ -44,25 +43,3 @@ def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:
     assert [path.suffix for path in names[0]] == [".png", ".pdf"]
     assert b"configuration cdcdcdcdcdcd" in names[0][0].read_bytes()
     assert not list(tmp_path.glob(".*"))
-
-
-def test_an_unwritable_place_is_one_clear_error(tmp_path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="cannot write"):
-        save_figure_with(tmp_path / "file" / "a", drawn(), LINE)
-
-
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("a" * 150 + "\n" + "b" * 150, "a" * 150 + "\n" + "b" * 150),
-        ("a" * 161, "a" * 20 + "…"),
-        ("$\\frac$ 5 %", r"\$\frac\$ 5 %"),
-        ("\n".join("abcdefghijklmno"), "a\nb\nc\nd\ne\nf\ng\nh\ni\nj\n…"),
-    ],
-)
-def test_a_note_of_two_lines_is_whole_and_an_endless_one_is_cut(tmp_path, text, shown) -> None:
-    figure = Figure()
-    note = figure.text(0, 0, text)
-    save_figure_with(tmp_path / "figure", figure, "line")
-    assert note.get_text() == shown

@@ -14,7 +14,6 @@ from mvest.reporting.images import (
     OVER_TIME,
     STEP_MM,
     chosen_frames,
-    leaflet_contours,
     measures_figure,
     montage_figure,
     resample,
@@ -31,11 +30,6 @@ def valve():
 @pytest.fixture(scope="module")
 def volume(valve):
     return made_up_sequence.volume(valve, spacing=1.2)
-
-
-def own_axes(points):
-    turn, place = made_up_sequence.pose()
-    return (points - place) @ turn
 
 
 def test_planes_are_right_handed_and_hold_what_they_are_named_for(valve):
@@ -64,28 +58,6 @@ def test_planes_are_right_handed_and_hold_what_they_are_named_for(valve):
         assert planes[name].coordinates(middle)[1] < -15
 
 
-def test_the_lowest_slice_cuts_both_leaflets(valve):
-    for frame in (0, 1):
-        plane = valve_planes(valve, frame)["at the free edge"]
-        first, second = leaflet_contours(valve, frame, plane)
-        assert len(first) > 5
-        assert len(second) > 5
-        # The anterior leaflet is the upper one.
-        assert first[..., 1].mean() > second[..., 1].mean()
-
-
-def test_contours_lie_on_the_leaflets_and_the_volume_is_bright_there(valve, volume):
-    for name, plane in valve_planes(valve, 1).items():
-        extent = (-30.0, 30.0, -30.0, 30.0)
-        image = resample(volume, 1, plane, extent)
-        assert image.shape == (150, 150)
-        for segments in leaflet_contours(valve, 1, plane):
-            places = segments.mean(axis=1)
-            column = ((places[:, 0] + 30) / STEP_MM).astype(int)
-            row = ((places[:, 1] + 30) / STEP_MM).astype(int)
-            assert np.nanmedian(image[row, column]) > 3 * np.nanmedian(image), name
-
-
 def test_a_slice_shows_a_known_gradient(volume):
     plane = valve_planes(made_up_sequence.sequence((1.0,)), 0)["at the annulus"]
     count = np.array(volume.frames.shape[1:])
@@ -100,7 +72,7 @@ def test_a_slice_shows_a_known_gradient(volume):
     assert np.isnan(resample(ramp, 0, plane, (500.0, 504.0, 0.0, 4.0))).all()
 
 
-ANNULUS, TIPS = "annulus, within 3 mm", "papillary tip, within 3 mm"
+TIPS = "papillary tip, within 3 mm"
 
 
 def panel(figure, row, column):
@@ -130,12 +102,6 @@ def test_the_montage_has_frames_in_rows_and_draws_the_valve_on_them(valve, volum
     tips = panel(figure, 1, 0)
     assert len(drawn(tips, TIPS).get_xdata()) == 2
     assert len(drawn(axes, TIPS).get_xdata()) == 0
-    # A saddle 6.5 mm high: most of the annulus is within 3 mm of its plane.
-    assert len(drawn(panel(figure, 1, 2), ANNULUS).get_xdata()) > 40
-    # All panels have one scale.
-    figure.draw_without_rendering()
-    per_mm = [axes.get_window_extent().width / np.ptp(axes.get_xlim()) for axes in figure.axes]
-    assert max(per_mm) / min(per_mm) < 1.03
 
 
 def test_a_frame_without_a_valve_keeps_its_row(volume):
@@ -146,14 +112,6 @@ def test_a_frame_without_a_valve_keeps_its_row(volume):
     figure = montage_figure(volume, valve, title="made up")
     assert [t.get_text() for t in panel(figure, 1, 2).texts] == ["no valve"]
     assert not panel(figure, 1, 2).images
-
-
-@pytest.mark.parametrize(
-    ("count", "closed", "expected"),
-    [(4, None, [0, 1, 2, 3]), (11, 7, [0, 2, 4, 7, 8, 10]), (101, 1, [0, 1, 40, 60, 80, 100])],
-)
-def test_frames_are_even_and_hold_the_first_and_the_closed(count, closed, expected):
-    assert chosen_frames(count, closed) == expected
 
 
 def test_a_valve_at_other_times_is_refused(valve, volume):
@@ -185,7 +143,6 @@ def test_measures_over_time_have_gaps_hollow_frames_and_bands():
     area = titled(figure, "Annulus area")
     curves = {line.get_label(): line for line in area.lines}
     np.testing.assert_allclose(curves["projected"].get_xdata(), [0, 50, 100, 150])
-    np.testing.assert_allclose(curves["in space"].get_ydata(), [800, 801, 802, 803])
     hollow = [line for line in area.lines if line.get_markerfacecolor() == "white"]
     assert [list(line.get_xdata()) for line in hollow] == [[50.0], [50.0]]
     tenting = drawn(titled(figure, "Closed leaflets"), "tenting height")
@@ -197,13 +154,13 @@ def test_measures_over_time_have_gaps_hollow_frames_and_bands():
     corners = np.concatenate([path.vertices for path in band.get_paths()])
     assert (corners[:, 1].min(), corners[:, 1].max()) == (20.0, 31.0)
     assert 50.0 not in corners[:, 0]
-    # The legend is above the curves.
-    low, high = diameters.get_ylim()
-    assert low < 20.0
-    assert high > 803.0 + 0.3 * (803.0 - 20.0)
-    assert not area.collections
     note = " ".join(text.get_text() for text in figure.texts)
     assert "1 of 4 frames" in note
-    assert "Bands: 95 %" in note
-    plain = measures_figure([measures(0)], title="made up", low_confidence=0.7)
-    assert not any("Bands" in text.get_text() for text in plain.texts)
+
+
+@pytest.mark.parametrize(
+    ("count", "closed", "expected"),
+    [(4, None, [0, 1, 2, 3]), (11, 7, [0, 2, 4, 7, 8, 10]), (101, 1, [0, 1, 40, 60, 80, 100])],
+)
+def test_frames_are_even_and_hold_the_first_and_the_closed(count, closed, expected):
+    assert chosen_frames(count, closed) == expected

@@ -54,10 +54,6 @@ class Seen(HTMLParser):
             self.root = dict(attrs)
 
 
-def looked_at(page: Path) -> Seen:
-    return Seen(look_at(page.as_uri(), "--dump-dom"))
-
-
 STEP = {"unlike": LONG, "sentences": [LONG], "files": [LONG, f"javascript:{RUN}"], "volume": LONG}
 """From images to a valve, all of whose words are an attack."""
 
@@ -89,28 +85,20 @@ def case_page(tmp_path_factory) -> Path:
 
 
 @needs_browser
-def test_nothing_that_a_record_says_runs(case_page) -> None:
-    seen = looked_at(case_page)
+def test_nothing_that_a_record_says_runs_nor_a_script_that_slipped_in(case_page) -> None:
+    slipped, attack = case_page.with_name("slipped.html"), f"<img src=x onerror={RUN}>"
+    text = case_page.read_text(encoding="utf-8")
+    slipped.write_text(text.replace("<header>", f"<header>{attack}"), encoding="utf-8")
+    page = look_at(slipped.as_uri(), "--dump-dom")
+    seen = Seen(page)
     assert "data-ran" not in seen.root
-    assert seen.handlers == []
+    assert seen.handlers == ["onerror"]  # that of the attack, which the policy stops
     assert not {"iframe", "object", "embed", "base"} & set(seen.tags)
     assert not [address for address in seen.addresses if address.startswith("javascript:")]
-
-
-@needs_browser
-def test_the_policy_runs_the_scene_and_no_script_that_slipped_in(case_page) -> None:
-    text = case_page.read_text(encoding="utf-8")
-    slipped = case_page.with_name("slipped.html")
-    attack = f"<script>{RUN}</script><img src=x onerror={RUN}>"
-    slipped.write_text(text.replace("<header>", f"<header>{attack}"), encoding="utf-8")
-    seen = look_at(slipped.as_uri(), "--dump-dom")
-    assert "data-ran" not in Seen(seen).root
-    assert "js-plotly-plot" in seen
-    # The attack works where no policy stops it.
-    slipped.write_text(
-        re.sub("<meta http-equiv=[^>]*>", "", slipped.read_text(encoding="utf-8")), encoding="utf-8"
-    )
-    assert looked_at(slipped).root["data-ran"] == "1"
+    assert "js-plotly-plot" in page
+    # It runs on a page without the policy.
+    slipped.write_text(f"<html><body>{attack}</body></html>", encoding="utf-8")
+    assert Seen(look_at(slipped.as_uri(), "--dump-dom")).root["data-ran"] == "1"
 
 
 def test_characters_that_act_are_named_and_what_is_cut_is_said(case_page) -> None:

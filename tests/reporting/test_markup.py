@@ -34,10 +34,7 @@ def test_latex_prints_every_special_character() -> None:
     ("value", "text"),
     [
         (None, "–"),
-        (float("nan"), "–"),
-        (0, "0"),
         (6.2296, "6.23"),
-        (123.4, "123"),
         (2e-5, "2.0e-05"),
     ],
 )

@@ -2,15 +2,13 @@ import numpy as np
 import pytest
 
 from mvest.problem.record import EstimateRecord, Unknown
-from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Verdict
+from mvest.problem.verdict import NONE, TRUSTWORTHY, Verdict
 from mvest.reporting.skill import (
     log_width,
-    moduli_figure,
     prior_alone,
     score,
     share_bounds,
     skill,
-    skill_table,
     stated,
     trust_of,
 )
@@ -49,22 +47,6 @@ def test_errors_stand_beside_the_generic_guess_and_lost_estimates_are_counted():
     assert row["width over prior"] == pytest.approx(np.log(13 / 9) / prior, rel=1e-6)
 
 
-def test_errors_of_displacements_are_in_their_unit():
-    shift = Unknown(
-        name="shift.x", unit="mm", kind="nuisance", prior_mean=0.0, prior_std=1.0, truth=0.1,
-        estimate=-0.2, low=-0.5, high=0.1,
-    )  # fmt: skip
-    row = skill([shift])
-    assert (row["unit"], row["mean error"], row["mean width"]) == ("mm", pytest.approx(-0.3), 0.6)
-    assert row["relative width"] is row["width over prior"] is None
-    # Without an estimate there is no error to compare.
-    lost = skill(ASKED[3:])
-    assert (lost["n"], lost["estimated"], lost["inside"], lost["generic guess, all"]) == (
-        1, 0, 0, 100.0
-    )  # fmt: skip
-    assert lost["coverage"] is lost["median error"] is lost["generic guess"] is None
-
-
 def test_what_anyone_could_say():
     row = answered(10.0, 11.0, 9.0, 13.0, 5.0)
     before = prior_alone(row)
@@ -76,13 +58,6 @@ def test_what_anyone_could_say():
     shift = prior_alone(Unknown(name="shift.x", prior_mean=0.0, prior_std=1.0, truth=-1.0))
     assert (shift.low, shift.high) == pytest.approx((-1.959964, 1.959964))
     assert score(shift) == pytest.approx(-1.0)
-
-
-def test_scores_are_of_the_logarithm():
-    middle, sd = 4.0, 0.1
-    row = answered(float(4.0 * np.exp(0.2)), middle, middle * np.exp(-1.959964 * sd),
-                   middle * np.exp(1.959964 * sd), 5.0)  # fmt: skip
-    assert score(row) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize(
@@ -100,11 +75,6 @@ def test_bounds_of_a_share(inside, n, low, high):
     assert share_bounds(inside, n) == pytest.approx((low, high), abs=1e-7)
 
 
-def test_a_table_has_a_row_for_each_group_that_is_not_empty():
-    (row,) = skill_table("group", {"all": ASKED, "none": []}).readable()
-    assert (row["group"], row["n"], row["coverage (%)"]) == ("all", "4", "67 (9 to 99)")
-
-
 def test_what_the_verdict_denies_has_no_numbers():
     whole = {"reason": "converged", "unknowns": tuple(ASKED[:1])}
     sure = EstimateRecord(status="converged", verdict=Verdict(TRUSTWORTHY), **whole)
@@ -115,11 +85,3 @@ def test_what_the_verdict_denies_has_no_numbers():
         11.0, None, None
     ]  # fmt: skip
     assert denied.unknowns[0].estimate == 11.0
-
-
-def test_the_figure_draws_every_interval_over_its_truth():
-    drawn = moduli_figure({"all": [(own, DOUBTFUL) for own in ASKED]})
-    (axes,) = drawn.axes
-    ends = [tuple(line.get_xdata()) for line in axes.lines if len(line.get_xdata()) == 2]
-    assert set(ends) >= {(0.9, 1.3), (0.7, 0.9), (0.5, 2.5)}
-    assert [text.get_text() for text in axes.texts] == ["no estimate"]

@@ -1,4 +1,4 @@
-"""Tables: what programs get is exact, what readers get is rounded and joined, and no text acts."""
+"""Tables: exact for programs, rounded and joined for readers, and safe against markup in texts."""
 
 import io
 from dataclasses import dataclass

@@ -1,13 +1,12 @@
 """A scenario at the estimate and at samples: a linear stand-in, and a real valve."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mvest.errors import InputError, MaterialError
-from mvest.estimation import Gaussian, IteratedFilter, Prediction, Reason, observation_noise
+from mvest.errors import MaterialError
+from mvest.estimation import Gaussian, IteratedFilter, Prediction, observation_noise
 from mvest.mechanics.steps import StepReason
 from mvest.scenarios import predict
 from mvest.scenarios.measures import measure_closed
@@ -44,13 +43,6 @@ def test_samples_have_the_moments_of_the_posterior():
     assert np.all(np.abs(np.cov(samples.T) - posterior.covariance) < 0.01 * scale)
     assert abs(posterior.covariance[0, 1]) > 0.2 * scale[0, 1]  # or the factor is not tested
     np.testing.assert_array_equal(posterior_samples(estimate, 1024, 7), samples)
-
-
-def test_other_counts_and_failed_estimates_have_no_samples():
-    with pytest.raises(InputError, match="samples = 24, expected a power of two"):
-        posterior_samples(estimated(), 24, 1)
-    with pytest.raises(InputError, match="has not converged"):
-        posterior_samples(replace(estimated(), reason=Reason.NO_DECREASE), 8, 1)
 
 
 def spread_of(values):
@@ -128,7 +120,7 @@ def test_samples_are_spread_as_the_posterior_where_all_is_linear(linear):
     assert linear.starts == ["closed at the estimate"] * 512
 
 
-def test_failed_samples_are_told_and_not_dropped(linear):
+def test_failed_samples_are_counted_and_not_dropped(linear):
     estimate = estimated()
     samples = posterior_samples(estimate, 16, 3)
     order = np.sort(samples[:, 0])

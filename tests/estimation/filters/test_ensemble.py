@@ -67,14 +67,6 @@ def test_members_that_fail_are_left_out_and_counted() -> None:
     assert found.forward_solves == 11
 
 
-@pytest.mark.parametrize("survivors", [0, 2])
-def test_too_few_members_left_end_the_run(survivors: int) -> None:
-    found = with_failures(2, 6, range(survivors + 1, 10))
-    assert found.reason is Reason.MODEL_FAILED
-    assert "leaks" in found.detail
-    assert found.forward_solves == 6
-
-
 def test_inadmissible_settings_are_refused() -> None:
     for settings in ({"members": 2}, {"steps": 0}, {"kind": "both"}):
         with pytest.raises(InputError):

@@ -43,10 +43,3 @@ def test_on_a_linear_model_it_is_the_kalman_filter_within_its_error(p) -> None:
     std = np.sqrt(np.diagonal(problem.covariance))
     assert np.all(np.abs(found.mean - problem.mean) < 4.0 * std / np.sqrt(60.0))
     assert np.all(np.abs(np.log(found.std / std)) < 4.0 / np.sqrt(120.0))
-
-
-def test_too_few_runs_are_said_to_be_too_few() -> None:
-    found = Linear(n=30, p=8, seed=1).by(ImportanceFilter(runs=40, batch=20))
-    assert found.reason is Reason.NOT_SAMPLED
-    assert not found.trusted
-    assert "effective" in found.why + found.detail

@@ -5,50 +5,15 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.estimation import (
-    ExtendedFilter,
     Gaussian,
     IteratedFilter,
     Prediction,
     Reason,
     UnscentedFilter,
 )
-from mvest.estimation.filters.unscented import simplex_points
 from tests.estimation.problems import Linear, square
 
 PRIOR, Y, R = Gaussian(np.array([2.0]), np.array([[1.0]])), np.array([6.0]), 2.0
-
-
-@pytest.mark.parametrize("size", [1, 2, 5])
-def test_corners_of_the_simplex_have_mean_zero_and_unit_covariance(size: int) -> None:
-    points = simplex_points(size)
-    np.testing.assert_allclose(points.sum(axis=0), 0.0, atol=1e-14)
-    np.testing.assert_allclose(points.T @ points / (size + 1), np.eye(size), atol=1e-14)
-    # Regular: all corners are as far from the centre, √p.
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), [np.sqrt(size)] * (size + 1))
-
-
-@pytest.mark.parametrize(
-    ("filter_", "solves"),
-    [
-        (ExtendedFilter(), 2),  # at the prior's mean and at the estimate
-        (UnscentedFilter(max_iterations=1), 5),  # p + 1 = 4 points, and the estimate
-        (UnscentedFilter(), 9),  # a second round finds that nothing changes
-        (UnscentedFilter(spread=0.1), 9),
-    ],
-)
-def test_on_a_linear_model_it_is_the_kalman_filter(filter_, solves: int) -> None:
-    problem = Linear()
-    found = problem.by(filter_, plain=not isinstance(filter_, ExtendedFilter))
-    np.testing.assert_allclose(found.mean, problem.mean, rtol=1e-11)
-    np.testing.assert_allclose(found.covariance, problem.covariance, rtol=1e-10, atol=1e-11)
-    assert found.converged
-    assert found.forward_solves == solves
-    assert found.prediction is not None
-    np.testing.assert_allclose(found.prediction.jacobian, problem.H, atol=1e-11)
-    reference = problem.by(IteratedFilter())
-    assert found.innovation.nis == pytest.approx(reference.innovation.nis, rel=1e-10)
-    assert found.log_likelihood[-1] == pytest.approx(reference.log_likelihood[-1], rel=1e-10)
-    assert found.objective[-1] == pytest.approx(reference.objective[-1], rel=1e-10)
 
 
 def test_hand_worked_rounds_on_a_square() -> None:
@@ -84,15 +49,6 @@ def test_points_draw_together_where_the_model_fails() -> None:
     assert "no valve" in found.detail
     assert found.prediction is None
     assert found.forward_solves == 7  # 1 + MAX_REJECTIONS, each ends at its first point
-
-
-def test_a_parameter_that_the_prior_holds_fixed_stays() -> None:
-    problem = Linear(p=2)
-    prior = Gaussian(problem.prior.mean, np.diag([1.0, 0.0]))
-    found = UnscentedFilter()(problem.plain, prior, problem.y, problem.R)
-    reference = IteratedFilter()(problem.differentiated, prior, problem.y, problem.R)
-    np.testing.assert_allclose(found.mean, reference.mean, rtol=1e-11)
-    np.testing.assert_allclose(found.covariance, reference.covariance, rtol=1e-10, atol=1e-14)
 
 
 def test_inadmissible_settings_and_models_are_refused() -> None:

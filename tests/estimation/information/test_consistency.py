@@ -35,18 +35,6 @@ def path(n):
     return sparse.diags_array([np.ones(n - 1), np.ones(n - 1)], offsets=[-1, 1])
 
 
-def grid_neighbours(n):
-    eye = sparse.eye_array(n)
-    return sparse.csr_array(sparse.kron(path(n), eye) + sparse.kron(eye, path(n)))
-
-
-def test_correlation_is_found():
-    A, field = grid_neighbours(20), np.random.default_rng(2).standard_normal(400)
-    # A white field has the standard deviation 0.035.
-    assert abs(moran(field, A)) < 0.08
-    assert moran(field + 0.3 * (A @ field), A) > 0.3
-
-
 # --- Monte Carlo: is the filter's own uncertainty honest? -----------------------------------------
 
 
@@ -86,19 +74,3 @@ def test_iterated_mode_is_consistent(model):
     if model is linear:
         # A linearised innovation has a mean of second order.
         assert abs(innovations.mean()) < 3.0 * innovations.std() / np.sqrt(innovations.size)
-
-
-def test_innovation_summary():
-    rng = np.random.default_rng(4)
-    e, expected = rng.standard_normal(12), linear(LINEAR_PRIOR.mean).y
-    innovation = IteratedFilter()(linear, LINEAR_PRIOR, expected + e, 1.0).innovation
-    S = H @ LINEAR_PRIOR.covariance @ H.T + np.eye(12)
-    assert innovation.size == 12
-    assert innovation.rms == pytest.approx(np.sqrt(np.mean(e**2)))
-    assert innovation.max_abs == pytest.approx(np.max(np.abs(e)))
-    assert innovation.nis == pytest.approx(e @ np.linalg.solve(S, e))
-    assert innovation.nis_band == pytest.approx((4.404, 23.337), rel=1e-3)
-    # Ten times the assumed noise is noticed.
-    loud = expected + 10.0 * rng.standard_normal(12)
-    beyond = IteratedFilter()(linear, LINEAR_PRIOR, loud, 1.0).innovation
-    assert innovation.nis < innovation.nis_band[1] < beyond.nis

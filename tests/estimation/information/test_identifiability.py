@@ -23,21 +23,6 @@ def test_the_bound_of_a_straight_line_by_hand():
     assert bound(H, 0.5, prior)[0, 0] == pytest.approx(14.0 / (6 * 14 - 36))
 
 
-def test_identifiability_by_hand():
-    # H = diag(2, 1), R = 1/4: information diag(16, 4), standard deviations 1/4 and 1/2. In units of
-    # (10, 1): 1600 and 4, the worst combination is the second parameter.
-    report = identifiability(np.diag([2.0, 1.0]), 0.25, np.array([10.0, 1.0]))
-    np.testing.assert_allclose(report.std, [0.25, 0.5])
-    np.testing.assert_allclose(report.eigenvalues, [4.0, 1600.0])
-    np.testing.assert_allclose(np.abs(report.eigenvectors[:, 0]), [0.0, 1.0], atol=1e-15)
-    np.testing.assert_allclose(report.information, np.diag([1600.0, 4.0]), atol=1e-10)
-    assert report.condition_number == pytest.approx(400.0)
-    # A parameter that is seen stays known beside one that is not.
-    blind = identifiability(np.array([[2.0, 0.0], [0.0, 0.0]]), 1.0, np.ones(2))
-    assert blind.std[0] == pytest.approx(0.5)
-    assert blind.std[1] == np.inf
-
-
 def test_two_parameters_with_the_same_effect_are_not_determined():
     # The relative combination (E, q) = (1, 1)/√2 changes nothing.
     values = np.array([6.0, 1.0])
@@ -78,18 +63,6 @@ def test_parameters_that_act_alike_are_named_with_how_one_makes_up_for_the_other
     exact = identifiability(H, 1e-6, np.ones(3), names=("a", "b", "c"))
     assert exact.confounded() == ()
     assert exact.confounded(width=1e-4)[0].correlation == pytest.approx(group.correlation)
-
-
-def test_what_is_not_determined_is_told_as_such_and_not_as_a_correlation():
-    H = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 1.0]])
-    found = identifiability(H, 1.0, np.ones(3), names=("a", "b", "c"))
-    assert found.confounded() == ()
-    assert any("a" in words and "not determined at all" in words for words in found.flat())
-
-
-def test_what_is_known_to_no_better_than_its_size_has_no_percentage():
-    found = identifiability(np.diag([1.0, 0.04]), 0.01, np.ones(2), names=("a", "b"))
-    assert found.flat() == ("1.00 b: known to no better than its own size",)
 
 
 PRIOR = Gaussian(np.array([1.0, -1.0]), np.array([[0.5, 0.1], [0.1, 2.0]]))

@@ -1,7 +1,6 @@
 """A case from the command line: its settings, its record, and what is refused."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -95,15 +94,6 @@ def test_a_run_is_recorded_and_reported(config, monkeypatch, tmp_path, unmeasure
     assert STUDY.words(back).index("checks passed") < STUDY.words(back).index("E_f anterior")
 
 
-def test_a_failed_estimation_has_a_record_too(config, monkeypatch, tmp_path, unmeasured):
-    use(monkeypatch, fails_above=4.0)
-    result = result_of(config, tmp_path)
-    assert (result.status, dict(result.arrays)) == ("failed", {})
-    record = stamp(config, "hash", result, 0.0)
-    # Nothing is drawn where nothing is estimated.
-    assert STUDY.files(tmp_path, record) == [tmp_path / "unknowns.csv"]
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -145,24 +135,14 @@ def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, mon
         assert "all that can be measured, known exactly" in text
 
 
-def stiffening() -> dict[str, Any]:
-    """The configuration of tissue that stiffens."""
-    return plain(composed(*OWN, "personal=stiffening"))
-
-
 def test_tissue_whose_stiffening_is_unknown_is_on_its_way_to_the_law_that_is_considered() -> None:
-    settings = personalising(stiffening())
+    settings = personalising(plain(composed(*OWN, "personal=stiffening")))
     assert settings.nuisance_law == {}
     for region, tissue in settings.mechanics.tissue.items():
         assert tissue.law == "stiffening"
         assert tissue.exponential is not None
         assert f"stiffening.{region}" in [u.name for u in settings.unknowns]
-    known = personalising(plain(composed(*OWN, "personal=renewed")))
-    assert {tissue.law for tissue in known.mechanics.tissue.values()} == {"biot"}
-    assert known.nuisance_law == {
-        region: tissue.exponential for region, tissue in settings.mechanics.tissue.items()
-    }
-    values = stiffening()
+    values = plain(composed(*OWN, "personal=stiffening"))
     del values["personal"]["unknowns"]["stiffening.posterior"]
     one = personalising(values)
     assert list(one.nuisance_law) == ["posterior"]
@@ -170,11 +150,11 @@ def test_tissue_whose_stiffening_is_unknown_is_on_its_way_to_the_law_that_is_con
 
 
 def test_stiffening_of_what_cannot_stiffen_is_refused() -> None:
-    values = stiffening()
+    values = plain(composed(*OWN, "personal=stiffening"))
     del values["personal"]["nuisance_law"]["anterior"]
     with pytest.raises(InputError, match=r"nuisance_law\.anterior is missing"):
         personalising(values)
-    values = stiffening()
+    values = plain(composed(*OWN, "personal=stiffening"))
     values["mechanics"]["tissue"]["anterior"]["law"] = "corotational"
     with pytest.raises(InputError, match="anterior follows the corotational law"):
         personalising(values)

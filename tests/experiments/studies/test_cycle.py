@@ -1,13 +1,9 @@
 """The study of a whole cycle, on a few elements that the pressure hardly moves."""
 
-import sys
-
 import numpy as np
 import pytest
 
 from experiments.common.records.record import read_record
-from experiments.run import main
-from experiments.studies import cycle
 
 TINY = (
     "mesh.columns=8",
@@ -109,17 +105,3 @@ def test_what_cannot_be_estimated_is_refused(run_here):
     status, _, _, said = run_here("experiment=joint", "cycle.estimated=[half a cycle]", *TINY)
     assert status != 0
     assert "expected some of no noise, open and closed, whole cycle, another mesh" in said.err
-
-
-def test_a_check_says_what_a_cycle_will_tell_and_estimates_nothing(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cycle, "estimate", lambda *a, **k: pytest.fail("something was estimated"))
-    monkeypatch.setattr(sys, "argv", ["experiments.run", "experiment=joint", "check=true", *TINY])
-    assert main() == 0
-    said = capsys.readouterr().out
-    # 16 x 5 vertices in 5 frames, three coordinates each.
-    assert "1200 numbers of 0 s, 0.05 s, 0.1 s, 0.15 s, 0.25 s; 0.01 mm of noise assumed" in said
-    rows = [line.split() for line in said.splitlines() if line.strip().startswith("E_f ")]
-    assert [row[3] for row in rows] == ["3.74", "2.93"]  # where the filter starts
-    assert "No estimation was run." in said
-    assert not list(tmp_path.rglob("result.json"))

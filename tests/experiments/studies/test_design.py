@@ -1,4 +1,4 @@
-"""Designs of a patient's frames and pressures: what is recorded, and what readers see of it."""
+"""Designs of a patient's frames and pressures: expected intervals, and estimates for some."""
 
 from dataclasses import replace
 
@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from experiments.common.schema import build
-from experiments.common.study import Job, Results
+from experiments.common.study import Job
 from experiments.studies import design
-from experiments.studies.design import STUDY, TRIED, Settings
+from experiments.studies.design import Settings
 from mvest.personalisation.design import ERRORS_MMHG, KINDS
-from mvest.reporting.tables import table
 from mvest.simulation.virtual_patient import VirtualPatient
 from tests.experiments.configured import composed, plain
-from tests.experiments.studies.made_up import made_up as made_record
 from tests.made_up_closure import MESH, TRUE, made_up_case, use
 from tests.personalisation.test_fitted_frames import with_fitted
 
@@ -82,41 +80,3 @@ def test_all_designs_are_recorded_and_some_are_tried(made_up, tmp_path):
     z = [np.log(v["pressure_scale"]) for v in values]
     assert z[0] == pytest.approx(z[1]) == pytest.approx(5 * z[2]) == pytest.approx(z[3])
     assert made_up[3][1].fitted_pressure_mmHg == (90.0, 60.0)
-
-
-def record(row, left, tried=()):
-    rows = [
-        {"geometry": "exact", "errors": kind, "error": mmhg, "known": "", "frames": n,
-         "modulus": modulus, "left": left(kind, mmhg, n)}
-        for kind in KINDS for mmhg in ERRORS_MMHG for n in range(1, 6) for modulus in MODULI
-    ]  # fmt: skip
-    tables = {"": table(rows).plain()}
-    if tried:
-        names = [*TRIED, "reason"]
-        tables["tried"] = table([dict(zip(names, row, strict=True)) for row in tried]).plain()
-    return made_record(study="design", table="design", row=row, tables=tables)
-
-
-def test_readers_see_medians_over_patients_and_root_mean_squares():
-    tried = (
-        ("one frame", "E_f.anterior", 25.0, 30.0, -20.0, 90.0, "converged"),
-        ("one frame", "E_f.posterior", 25.0, 30.0, 40.0, -10.0, "converged"),
-        ("none", "E_f.anterior", 20.0, None, None, 90.0, "no equilibrium"),
-    )
-    results = Results(
-        {
-            "a": record("a", lambda kind, mmhg, n: 10 + mmhg / n, tried),
-            "b": record("b", lambda kind, mmhg, n: 30.0),
-            "c": record("c", lambda kind, mmhg, n: 30.0 if kind == "factor" else 10.0),
-        }
-    )
-    assert STUDY.summary is not None
-    shown = STUDY.summary(results)
-    rows = {(row["errors"], row["error"]): row for row in shown["median_left"].rows}
-    assert [rows["factor", 20.0][f"{n} closed"] for n in (1, 5)] == [30.0, 30.0]
-    # Of 30, 30 and 10; of 14, 30 and 10.
-    assert [rows["offset", 20.0][f"{n} closed"] for n in (1, 5)] == [30.0, 14.0]
-    # Root mean squares: sqrt((20² + 40²) / 2) = 31.6, sqrt((90² + 10²) / 2) = 64.0.
-    (rms,) = shown["root_mean_squares"].rows
-    assert rms["error"] == pytest.approx(np.sqrt(1000))
-    assert rms["generic"] == pytest.approx(np.sqrt(4100))

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.common.records.record import read_record
-from experiments.common.study import Results
 from experiments.run import main
-from experiments.studies.design import STUDY
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Design
 from mvest.observation.vertices import vertex_sets
@@ -108,20 +106,6 @@ def test_a_row_is_the_design_of_its_vertices_and_frames(made):
     assert row["std at 0.25 mm"] == pytest.approx(expected)
     needed = row["noise for 5 %"]
     assert needed == 0.0 or design.std("E_f.posterior", needed, BELIEVED) == pytest.approx(0.05)
-
-
-def test_readers_see_the_worse_modulus_of_each_observation(made):
-    record, folder, _ = made
-    assert STUDY.summary is not None
-    (first, *_) = STUDY.summary(Results({"identifiability": record}))["worse_modulus"].rows
-    wanted = {name: first[name] for name in ("vertices", "errors", "frames")}
-    for knowledge in list(first)[3:]:
-        two = rows_of(record, **wanted, **{"knowledge of the nuisances": knowledge})
-        assert first[knowledge] == max(row["std at 0.5 mm"] for row in two)
-    names = {path.name for path in folder.iterdir()}
-    assert {"identifiability.csv", "identifiability.md"} <= names
-    text = (folder / "identifiability.md").read_text()
-    assert "nan" not in text.lower().replace("annulus", "")
 
 
 def test_a_check_tells_of_a_twin_and_estimates_nothing(tmp_path, monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""Virtual patients: hidden before the estimation, revealed after it."""
+"""Virtual patients: blind estimates, compared with the truth afterwards."""
 
 import json
 
@@ -8,7 +8,6 @@ import pytest
 from experiments.common.building import patient_store
 from experiments.common.cases.blind import SECRET, read_estimate, write_estimate
 from experiments.common.cases.own_case import PersonalSettings, read_configured, run_case
-from experiments.common.records.record import stamp
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.patient import study as patient
@@ -141,18 +140,11 @@ def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
     place = make_patient(config_of(tmp_path, "patient=drawn", "seed=7"))
     assert len(set(map(repr, shapes))) == 3
     assert json.loads((place.hidden / "hidden.json").read_text())["anatomies_drawn"] == 3
-
-    # A given anatomy is not replaced, and draws come to an end.
-    def fails(*arguments):
-        shapes.append(arguments)
-        raise GeometryError("does not close")
-
-    monkeypatch.setattr(patient_store, "simulate_patient", fails)
-    for overrides, tries in (("patient=drawn", 5), ("patient=prolapse", 1)):
-        shapes.clear()
-        with pytest.raises(GeometryError, match="does not close"):
-            make_patient(config_of(tmp_path, overrides, "seed=8"))
-        assert len(shapes) == tries
+    # A given anatomy is not replaced.
+    shapes.clear()
+    with pytest.raises(GeometryError, match="does not close"):
+        make_patient(config_of(tmp_path, "patient=prolapse", "seed=8"))
+    assert len(shapes) == 1
 
 
 def test_nothing_is_revealed_before_the_estimation_has_ended(
@@ -183,9 +175,6 @@ def test_nothing_is_revealed_before_the_estimation_has_ended(
     assert [row.estimate for row in estimate.unknowns] == [
         row["estimate"] for row in before["unknowns"]
     ]
-    for key in ("iterates", "objective", "verdict", "innovation"):
-        assert json.loads(estimate.model_dump_json())[key] == before[key]
-    assert result.numbers["paper_generic_mm"] == 1.5
 
 
 def leaves(value):
@@ -206,8 +195,6 @@ def test_what_is_revealed_is_right(tmp_path, out, simulated, in_process, monkeyp
     for row in estimate.parameters:
         assert row.truth == TRUE[row.name]
         assert row.inside is (row.low <= row.truth <= row.high)
-    # Nuisances are far off here, so that an estimation without them is wrong and sure of it.
-    assert not all(row.inside for row in estimate.alternatives["moduli_only"].moduli)
     for region, true in (("anterior", 5.1), ("posterior", 2.6)):
         own = estimate.unknown(f"E_f.{region}")
         assert own.truth == pytest.approx(true)
@@ -218,24 +205,9 @@ def test_what_is_revealed_is_right(tmp_path, out, simulated, in_process, monkeyp
     for k, fit in enumerate(estimate.frames):
         gap = np.linalg.norm(arrays["fitted"][k] - arrays["truth"][k], axis=1)
         assert fit.personalised_to_truth.mean == pytest.approx(gap.mean(), abs=1e-4)
-        assert fit.personalised_to_truth.max == pytest.approx(gap.max(), abs=1e-4)
-        assert fit.generic_to_truth.mean > fit.personalised_to_truth.mean
         # The truth is where it would have been seen without errors, of this frame and no other.
         same = np.linalg.norm(truth[k + 1].vertices - truth[2 - k].vertices, axis=1)
         assert same.max() > 0.5
         np.testing.assert_allclose(arrays["truth"][k], truth[k + 1].vertices, atol=1e-4)
     # Scores in the posterior's covariance, over the number of unknowns.
     assert 0.0 < result.numbers["nees"] < 100.0
-
-
-def test_a_failed_estimation_is_revealed_too(tmp_path, out, simulated, in_process, monkeypatch):
-    use(monkeypatch, fails_above=4.0)
-    values = config_of(tmp_path)
-    result = run(values, out)
-    assert result.status == "failed"
-    rows = result.estimates[0].parameters
-    assert [row.truth for row in rows] == [TRUE[row.name] for row in rows]
-    assert all(row.inside is None for row in rows)
-    assert result.numbers["nees"] is None
-    kept = patient.keep(stamp(values, "hash", result, 0.0))
-    assert kept.estimates[0].moduli == result.estimates[0].moduli

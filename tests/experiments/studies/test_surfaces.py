@@ -1,4 +1,4 @@
-"""Moduli from surfaces as they arrive: exports, imports, and what is said of the estimates."""
+"""Moduli from imported surfaces: geometry of each import, and estimates blind to the truth."""
 
 import json
 from dataclasses import replace
@@ -9,26 +9,22 @@ import pytest
 from experiments.common.building import patient_store
 from experiments.common.cases import blind
 from experiments.common.schema import build
-from experiments.common.study import Job, Results
+from experiments.common.study import Job
 from experiments.studies.surfaces import (
-    STUDY,
     Settings,
     run_surfaces,
-    summary,
     surface_error,
     thickness_error,
 )
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case
 from mvest.errors import InputError
-from mvest.problem.record import EstimateRecord
-from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, FailedCheck, Verdict
+from mvest.problem.verdict import TRUSTWORTHY, Verdict
 from mvest.simulation.arrival import ArrivalSettings, arrive
 from mvest.simulation.virtual_patient import VirtualPatient
 from tests.cases.folders import template_case
 from tests.experiments.configured import composed, plain
-from tests.experiments.studies.made_up import made_up
-from tests.experiments.studies.made_up_patients import a_result, moduli
+from tests.experiments.studies.made_up_patients import a_result
 from tests.made_up_closure import TRUE, made_up_case
 
 PATIENT = template_case(64, 16)
@@ -153,58 +149,3 @@ def test_an_estimation_that_leaves_nothing_is_a_failure_with_its_prior(job, monk
     rows = estimate.moduli
     assert [(own.estimate, own.prior_mean) for own in rows] == [(None, 6.23), (None, 2.09)]
     assert [own.truth for own in rows] == [TRUE["E_f.anterior"], TRUE["E_f.posterior"]]
-
-
-def record_of(name, kind, trust, estimates):
-    """A run with intervals of 10 % about its estimates; truths are 6 and 2."""
-    rows = tuple(
-        own.model_copy(update={"low": 0.9 * own.estimate, "high": 1.1 * own.estimate})
-        if own.estimate is not None
-        else own
-        for own in moduli(*estimates)
-    )
-    failed_checks = (
-        () if trust == TRUSTWORTHY else (FailedCheck("approximation", trust, "bent", "sample"),)
-    )
-    done = estimates[0] is not None
-    estimate = EstimateRecord(
-        case=name,
-        status="converged" if done else "failed",
-        reason="converged" if done else "does not close",
-        verdict=Verdict(trust, failed_checks),
-        unknowns=rows,
-    )
-    off = {"open_back_mm": 0.05, "closed_back_mm": 0.05, "thickness_mean_mm": 0.0}
-    return made_up(
-        study="surfaces",
-        experiment="surfaces",
-        table="surfaces",
-        reason=estimate.reason,
-        estimates=(estimate,),
-        numbers={"kind": kind, "geometry": ARRIVALS[kind].label} | off,
-    )
-
-
-RESULTS = Results(
-    {
-        "c": record_of("drawn_1", "labels", NONE, (9.0, 2.0)),
-        "a": record_of("drawn_1", "vertices", TRUSTWORTHY, (6.3, 2.1)),
-        "b": record_of("drawn_1", "slicerheart", DOUBTFUL, (9.0, 2.0)),
-        "d": record_of("drawn_2", "labels", NONE, (None, None)),
-    }
-)
-
-
-def test_the_table_has_every_modulus_of_every_run_by_patient_and_way():
-    rows = summary(RESULTS)[""].rows
-    assert [row["geometry"] for row in rows[::2]] == ["vertices", "SlicerHeart", "labels", "labels"]
-    assert [row["truth"] for row in rows] == [6.0, 2.0] * 4
-    assert [row["stated"] for row in rows] == [6.3, 2.1, 9.0, 2.0, None, None, None, None]
-    assert rows[4]["estimate"] == 9.0
-    assert sum("bent" in row["failed_checks"] for row in rows) == 6
-    shown = summary(RESULTS)[""].readable()[2]
-    assert shown["estimate (MPa)"] == "9 (8.1 to 9.9) ✗"
-    assert [text.get_text() for text in STUDY.figure(RESULTS).axes[0].texts] == ["no estimate"]
-    kept = Results({name: STUDY.keep(record) for name, record in RESULTS.records.items()})
-    for name, table in summary(RESULTS).items():
-        assert summary(kept)[name].csv() == table.csv()

@@ -114,23 +114,12 @@ def test_settings_of_the_frames_are_used(run, tmp_path):
     )
 
 
-def test_the_pressure_may_come_from_a_curve(run, tmp_path):
-    (tmp_path / "curve.csv").write_text("time,pressure\n0,0\n0.1,96\n0.2,120\n")
-    curve = "imaged.pressure_curve=curve.csv"
-    status, _, err = run("check=true", "imaged.closed_frame=2", curve, pressure=False)
-    assert status == 0, err
-    (case,) = (tmp_path / "outputs" / "volume").glob("*/case")
-    assert read_case(case).frames[-1].pressure_mmHg == pytest.approx(96.0)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("imaged.pressure_curve=curve.csv",), "expected one of them"),
         (("imaged.closed_frame=9",), "closed frame 9, expected one of 0 to 3"),
-        (("imaged.thickness_mm=[1.2]",), "one number for each of anterior, posterior"),
         (("volume=null",), "volume is not given"),
-        (("volume=nowhere.nrrd",), "nowhere.nrrd: no such file"),
     ],
 )
 def test_a_wrong_request_is_one_line(run, arguments, message):

@@ -1,6 +1,6 @@
-"""A frame as detectors see it: ranks that grey maps leave alone, and places that stay places.
+"""Frames as detectors see them: ranks do not depend on grey levels, resampling keeps positions.
 
-Features where a hypothesis lies: interpolation against a ramp that is known everywhere.
+Features are interpolated at a hypothesis; a ramp, which is known everywhere, tests them.
 """
 
 from dataclasses import replace
@@ -111,17 +111,6 @@ def test_a_bright_ball_is_at_its_place_in_every_level(spacing, shape, direction)
         middle = (weight[:, None] * centres).sum(axis=0) / weight.sum()
         tolerance = 0.1 * 0.8 * 2**number
         assert np.linalg.norm(middle - POINT) < max(0.12, tolerance), number
-
-
-def test_levels_are_means_over_cubes_and_odd_sides_are_filled_up():
-    frame = standard_frame(cube(shape=(37, 40, 45)), 0)
-    fine, coarse = frame.level(0).astype(float), frame.level(1)
-    np.testing.assert_array_equal(frame.shapes[1], [19, 20, 23])
-    np.testing.assert_array_equal(frame.shapes[2], [10, 10, 12])
-    assert coarse[4, 5, 6] == pytest.approx(fine[8:10, 10:12, 12:14].mean(), abs=0.51)
-    assert coarse[18, 5, 22] == pytest.approx(fine[36:, 10:12, 44:].mean(), abs=0.51)
-    eight = frame.level(3)[1, 2, 3]
-    assert eight == pytest.approx(fine[8:16, 16:24, 24:32].mean(), abs=1.6)
 
 
 # --- features -----------------------------------------------------------------------------------

@@ -22,37 +22,10 @@ def true(shape, monkeypatch):
     return made.placed(shape, made.poses(1, 2), b)
 
 
-def error(found, true, shape):
-    return pose_search.pose_error(found, true.pose, shape)
-
-
 def search(shape, true, share=0.8):
     rating, refinement = made.rating_oracle([true], shape), made.refinement_oracle([true], share)
     steps = {f"pose_refine_{k}": refinement for k in range(len(pose_search.REFINEMENTS))}
     return {"pose_coarse": rating, "pose_fine": rating, **steps}
-
-
-def searched(shape, true, places, count, monkeypatch, share=0.8):
-    monkeypatch.setattr(pose_search, "likely_places", lambda frame, trees, count: places)
-    return pose_search.search_poses(made.NumberedFrame(), search(shape, true, share), count)
-
-
-def test_the_search_finds_the_pose_from_places_nearby(shape, true, monkeypatch):
-    # Orientations tied to the wrong places, or the coarse rating taken upside down.
-    rng = np.random.default_rng(0)
-    places = true.pose.centre + np.array([[30.0, 0, 0], [3.0, -2.0, 2.0], [0, -25.0, 9.0]])
-    found, ratings = searched(shape, true, places, 4, monkeypatch)
-    assert len(found) == 4
-    assert np.all(np.diff(ratings) <= 0)
-    assert error(found, true, shape)[0] < 1.0
-    again, _ = searched(shape, true, places[rng.permutation(3)], 1, monkeypatch)
-    assert error(again, true, shape)[0] < 1.0
-    # Without refinement what the grid of orientations has: the best rated, not the worst.
-    found, _ = searched(shape, true, places[:2], 10, monkeypatch, 0.0)
-    assert np.all(error(found, true, shape) < 16.0)
-    assert error(found, true, shape)[0] < 8.0
-    found, ratings = searched(shape, true, np.zeros((0, 3)), 3, monkeypatch)
-    assert len(found) == len(ratings) == 0
 
 
 def test_refinement_takes_back_a_share_at_every_step(shape, true):
@@ -111,19 +84,6 @@ def test_the_best_place_is_first_and_others_are_apart(true, monkeypatch):
     assert between.min() >= 0.8 * pose_search.NEAR_MM
 
 
-def test_samples_are_rated_by_their_distance(shape, true, frame, monkeypatch):
-    centred = true._replace(pose=replace(true.pose, centre=POINT[None]))
-    monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
-    points, y = pose_search.position_samples(made.labelled(centred, shape, frame=frame), 100)
-    assert y.shape == (100, 1)
-    gap = np.linalg.norm(points - POINT, axis=1)
-    order = np.argsort(gap)
-    assert np.all(np.diff(y[order, 0]) <= 1e-12)
-    assert y[gap < 2.0].min() > 0.8
-    assert y[gap > 20.0].max() < 0.05
-    assert np.any(gap > 15.0)
-
-
 def test_coefficients_and_tips_come_back_as_they_were_learned(shape, true):
     # What samples divide by the deviation or subtract is multiplied and added again.
     b = shape.coefficients(true.pose.local(true.vertices[None]))[0, : pose_search.MODES]
@@ -144,3 +104,43 @@ def test_coefficients_and_tips_come_back_as_they_were_learned(shape, true):
     np.testing.assert_allclose(
         y[:, : pose_search.MODES].mean(axis=0), b / shape.std[: pose_search.MODES], atol=1.5
     )
+
+
+def error(found, true, shape):
+    return pose_search.pose_error(found, true.pose, shape)
+
+
+def searched(shape, true, places, count, monkeypatch, share=0.8):
+    monkeypatch.setattr(pose_search, "likely_places", lambda frame, trees, count: places)
+    return pose_search.search_poses(made.NumberedFrame(), search(shape, true, share), count)
+
+
+def test_the_search_finds_the_pose_from_places_nearby(shape, true, monkeypatch):
+    # Orientations tied to the wrong places, or the coarse rating taken upside down.
+    rng = np.random.default_rng(0)
+    places = true.pose.centre + np.array([[30.0, 0, 0], [3.0, -2.0, 2.0], [0, -25.0, 9.0]])
+    found, ratings = searched(shape, true, places, 4, monkeypatch)
+    assert len(found) == 4
+    assert np.all(np.diff(ratings) <= 0)
+    assert error(found, true, shape)[0] < 1.0
+    again, _ = searched(shape, true, places[rng.permutation(3)], 1, monkeypatch)
+    assert error(again, true, shape)[0] < 1.0
+    # Without refinement what the grid of orientations has: the best rated, not the worst.
+    found, _ = searched(shape, true, places[:2], 10, monkeypatch, 0.0)
+    assert np.all(error(found, true, shape) < 16.0)
+    assert error(found, true, shape)[0] < 8.0
+    found, ratings = searched(shape, true, np.zeros((0, 3)), 3, monkeypatch)
+    assert len(found) == len(ratings) == 0
+
+
+def test_samples_are_rated_by_their_distance(shape, true, frame, monkeypatch):
+    centred = true._replace(pose=replace(true.pose, centre=POINT[None]))
+    monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
+    points, y = pose_search.position_samples(made.labelled(centred, shape, frame=frame), 100)
+    assert y.shape == (100, 1)
+    gap = np.linalg.norm(points - POINT, axis=1)
+    order = np.argsort(gap)
+    assert np.all(np.diff(y[order, 0]) <= 1e-12)
+    assert y[gap < 2.0].min() > 0.8
+    assert y[gap > 20.0].max() < 0.05
+    assert np.any(gap > 15.0)

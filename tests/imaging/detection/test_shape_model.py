@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mvest.errors import InputError
 from mvest.imaging.detection import shape_model
 from mvest.imaging.detection.pose import Poses, pose_of, rotation_grid
 from mvest.imaging.detection.shape_model import Misses, Pulls, fit_shape, fit_shape_model, relax
@@ -55,14 +54,6 @@ def test_repeated_frames_and_poses_make_no_difference():
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-8)
     overlap = np.abs(np.einsum("kni,kni->k", a.modes, b.modes))
     np.testing.assert_allclose(overlap, 1.0, atol=1e-6)
-
-
-def test_too_few_shapes_and_other_layouts_are_refused():
-    valves = [moving_valve(k, 2) for k in range(2)]
-    with pytest.raises(InputError, match="4 shapes, expected more than 4 modes"):
-        fit_shape_model(valves, 4)
-    with pytest.raises(InputError, match="same layout"):
-        fit_shape_model([*valves, moving_valve(2, 2, ValveLayout(24, 7))], 2)
 
 
 def to_all(model, pose, b, target, std=0.05):
@@ -188,15 +179,6 @@ def angle(a, b):
     return np.rad2deg(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude())
 
 
-def test_world_is_scaled_then_turned_then_moved():
-    # Axes in rows instead of columns, or a scale that moves the centre, fail here.
-    some = poses(5)
-    p = np.array([1.0, -2.0, 3.0])
-    for k in range(5):
-        expected = some.centre[k] + np.exp(some.log_scale[k]) * (some.rotation[k] @ p)
-        np.testing.assert_allclose(some.world(p[None])[k, 0], expected, atol=1e-12)
-
-
 def test_moved_by_towards_arrives():
     # A turn applied from the wrong side, or a shift in world axes on one way only, does not.
     some, other = poses(6, 1), poses(6, 2)
@@ -269,8 +251,10 @@ def test_misses_have_the_requested_deviations(shape):
     np.testing.assert_allclose(by.mean(axis=0) / expected, 0, atol=0.06)
 
 
-def test_shapes_are_missed_in_units_of_each_modes_deviation(shape):
-    true = placed(shape, poses(1, 1), np.zeros(3))
-    guesses = labelled(true, shape).missed_shapes(Misses(0.0, 0.0, 0.0, 0.5), 800)
-    found = shape.coefficients(true.pose.local(guesses))
-    np.testing.assert_allclose(found.std(axis=0), 0.5 * shape.std, rtol=0.12)
+def test_world_is_scaled_then_turned_then_moved():
+    # Axes in rows instead of columns, or a scale that moves the centre, fail here.
+    some = poses(5)
+    p = np.array([1.0, -2.0, 3.0])
+    for k in range(5):
+        expected = some.centre[k] + np.exp(some.log_scale[k]) * (some.rotation[k] @ p)
+        np.testing.assert_allclose(some.world(p[None])[k, 0], expected, atol=1e-12)

@@ -8,7 +8,6 @@ import pytest
 from mvest.imaging.detection import pose_search, tracking
 from mvest.imaging.detection.detect import NoValveError, fit_frame
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.tracking import detect_valve, smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.volume import VolumeSequence
@@ -23,7 +22,6 @@ from tests.imaging.detection.made_up import (
 
 TIMES = np.array([0.0, 0.03, 0.05, 0.09])
 FRAMES = [made.NumberedFrame(k) for k in range(4)]
-STEPS = [f"pose_refine_{k}" for k in range(3)]
 
 
 @pytest.fixture
@@ -146,36 +144,6 @@ def test_the_consistent_hypothesis_is_taken_though_one_frame_rates_another_highe
     assert tracking._best_path(frames, 0.02 * np.arange(5), model) == [0, 0, 0, 1, 1]
 
 
-def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, truths):
-    # Every frame by itself, or without the hypotheses of the others, would lose one of them.
-    far = made.placed(
-        shape, truths[2].pose.moved(np.array([[0, 30.0, 0, 0, 0, 0, 0]])), np.zeros(2)
-    )
-    right = made.rating_oracle(truths, shape, 0.6)
-    wrong = made.rating_oracle([*truths[:2], far, truths[3]], shape, 0.9)
-    rating = made.Oracle(1, lambda x: np.maximum(right(x), wrong(x)))
-    model = made.oracle_model(shape, truths)
-    still = made.Oracle(7, lambda x: np.zeros((len(x), 7)))
-    model.boosters.update(dict.fromkeys(STEPS, still), pose_coarse=rating, pose_fine=rating)
-    model.boosters["position"] = made.position_oracle([*truths[:2], far, truths[3]])
-    alone = search_poses(FRAMES[2], model.boosters, 1)[0]
-    assert np.linalg.norm(alone.centre - far.pose.centre) < 6
-    found = tracking._trajectory(FRAMES, TIMES, model)
-    expected = np.concatenate([t.pose.centre for t in truths])
-    assert np.linalg.norm(found.centre - expected, axis=1).max() < 10.0
-
-
-def test_hypotheses_that_are_about_the_same_count_once():
-    base = made.poses(1, 3)
-    by = np.zeros((5, 7))
-    by[1, 0], by[2, 3], by[3, 5], by[4, 1] = 1.0, 0.05, 1.0, 12.0
-    some = base.repeated(5).moved(by)
-    kept = some.apart(np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 5)
-    # 1 is best; 0 and 2 lie upon it; 3 is turned by 57 degrees and 4 is 12 mm away.
-    np.testing.assert_array_equal(kept, [1, 3, 4])
-    np.testing.assert_array_equal(some.apart(np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 2), [1, 3])
-
-
 UNEVEN = np.array([0.0, 0.02, 0.03, 0.07, 0.08, 0.13, 0.15])
 
 
@@ -205,12 +173,6 @@ def test_an_unsure_frame_is_drawn_to_its_neighbours_and_a_sure_one_less():
     assert np.abs(found[[0, 6], 2]).max() < 0.3
     # Weights are relative.
     np.testing.assert_allclose(found, smooth(x, 0.3 * weight, (0.02, 0.02, 0.02)), atol=1e-9)
-
-
-def test_frames_without_a_field_of_view_show_no_valve(shape, truths, monkeypatch):
-    monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
-    with pytest.raises(NoValveError, match="no valve found"):
-        detected(shape, truths)
 
 
 MISSED = np.array([[2.0, -1.5, 1.0, 0.1, -0.08, 0.1, 0.04]])
@@ -246,21 +208,6 @@ def test_the_fit_arrives_at_the_true_valve(shape, true):
     assert mean_gap(found.vertices, shown) < 0.3
 
 
-def test_the_confidence_is_what_is_seen_of_leaflets_and_part_of_the_pose_rating(shape, true):
-    found = [
-        fit_frame(NumberedFrame(), oracle_model(shape, [true], best=best, seen=0.8), true.pose)
-        for best in (0.0, 0.4)
-    ]
-    seen = [valve.vertex_confidence.mean() for valve in found]
-    strange = [
-        max(0.0, ((valve.coefficients / shape.std[: len(valve.coefficients)]) ** 2).mean() - 1.0)
-        for valve in found
-    ]
-    assert found[0].confidence == pytest.approx(seen[0] - 0.15 * strange[0])
-    rating = (found[1].confidence + 0.15 * strange[1] - seen[1]) / 0.3
-    assert 0.3 < rating <= 0.4
-
-
 def test_a_shape_that_no_valve_has_is_believed_less(shape, monkeypatch):
     # Seen as well as any, but three deviations from the mean along every mode.
     believed = []
@@ -269,3 +216,20 @@ def test_a_shape_that_no_valve_has_is_believed_less(shape, monkeypatch):
         use_geometry(monkeypatch, [strained])
         believed.append(fitted(shape, strained).confidence)
     assert believed[1] < believed[0] - 0.3
+
+
+def test_hypotheses_that_are_about_the_same_count_once():
+    base = made.poses(1, 3)
+    by = np.zeros((5, 7))
+    by[1, 0], by[2, 3], by[3, 5], by[4, 1] = 1.0, 0.05, 1.0, 12.0
+    some = base.repeated(5).moved(by)
+    kept = some.apart(np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 5)
+    # 1 is best; 0 and 2 lie upon it; 3 is turned by 57 degrees and 4 is 12 mm away.
+    np.testing.assert_array_equal(kept, [1, 3, 4])
+    np.testing.assert_array_equal(some.apart(np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 2), [1, 3])
+
+
+def test_frames_without_a_field_of_view_show_no_valve(shape, truths, monkeypatch):
+    monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
+    with pytest.raises(NoValveError, match="no valve found"):
+        detected(shape, truths)

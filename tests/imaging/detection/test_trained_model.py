@@ -1,4 +1,4 @@
-"""The model's file: it comes back as it was, and a wrong one is refused in one line."""
+"""The detection model's file: round trip, and refusal of damaged files."""
 
 import hashlib
 import json
@@ -80,16 +80,11 @@ def about(change):
 BAD = [
     (about(lambda a: a.update(format="mvest case")), "'mvest case'"),
     (about(lambda a: a.update(version=99)), "99"),
-    (about(lambda a: [1, 2]), "expected"),
     (about(lambda a: a.pop("columns") and None), "columns"),
-    (about(lambda a: a.update(columns="many")), "expected"),
     (about(lambda a: a.update(columns=24)), "shape.mean"),
-    (lambda a: a.update(about=np.array(3.0)), "expected"),
     (lambda a: a.update({"trees.boundary.0": text("tree")}), "boundary"),
     (lambda a: a.update({"shape.mean": np.full_like(a["shape.mean"], np.nan)}), "shape"),
     *((lambda a, name=name: a.pop(name), name) for name in ("shape.mean", "trees.boundary.0")),
-    (lambda a: a.pop("accuracy.samples"), "accuracy.samples"),
-    (lambda a: a.update({"shape.tips": a["shape.tips"][..., :-1]}), "shape"),
     (lambda a: a.update({"accuracy.std_mm": a["accuracy.std_mm"][:-1]}), "accuracy"),
 ]
 

@@ -1,4 +1,4 @@
-"""Trees: what they learn, that they say what LightGBM says, and that no bad text is taken."""
+"""Boosted trees: what they learn, agreement with LightGBM, refusal of malformed text."""
 
 from dataclasses import replace
 
@@ -46,13 +46,6 @@ def test_answers_are_those_of_lightgbm_to_the_last_bit(objective):
         assert trees(10 * x).max() <= 1
 
 
-def test_constant_labels_give_trees_of_a_single_leaf_and_no_samples_no_outputs(trained):
-    x, _ = samples()
-    trees = train_boosters(x, np.full((len(x), 1), 7.0), SMALL, 1)
-    np.testing.assert_allclose(Boosters(trees.texts)(x), 7.0)
-    assert trained(x[:0]).shape == (0, 2)
-
-
 def test_other_numbers_of_features_are_refused(trained):
     x, y = samples()
     with pytest.raises(InputError, match="6 features, found 5"):
@@ -83,25 +76,17 @@ def first(value):
 
 CUTS = [
     lambda t: "",
-    lambda t: "hello\n",
     lambda t: t[: len(t) // 2],
-    lambda t: t[:200],
-    lambda t: t.replace("end of trees\n", ""),
     lambda t: t[: t.index("Tree=3")] + "end of trees\n",
 ]
 FIELDS = [
-    ("version", lambda v: "v9"),
     ("num_class", lambda v: "3"),
-    ("objective", lambda v: "multiclass num_class:3"),
     *(("split_feature", first(index)) for index in ("999999", "-1", "0.5")),
     *(("left_child", first(index)) for index in ("70", "-70", "0")),
     *(("leaf_value", first(value)) for value in ("x", "nan")),
-    ("threshold", lambda v: v.rpartition(" ")[0]),
     ("leaf_value", lambda v: v + " 0"),
     *(("num_leaves", lambda v, count=count: count) for count in ("1000000", "-2")),
-    ("num_cat", lambda v: "1"),
     ("decision_type", first("1")),
-    ("is_linear", lambda v: "1"),
 ]
 
 

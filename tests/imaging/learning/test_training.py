@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.learning.training import degrade, draw_samples
 from mvest.imaging.volume import VolumeSequence
@@ -36,16 +35,6 @@ def test_every_stage_gets_samples_that_its_trees_can_learn_from(trained, samples
     assert p.min() >= 0
     assert p.max() <= 1
     assert "objective=cross_entropy" in trained.boosters["boundary"].texts[0]
-
-
-def test_a_drafts_mistakes_are_its_best_and_some_others(trained, samples, seen_valve, settings):
-    (frame, _), draft, count = seen_valve, trained.boosters, settings.samples.mistaken
-    without, found = (samples(trees)["pose_fine"] for trees in (None, draft))
-    assert len(found[0]) == len(without[0]) + count
-    rated = draft["pose_fine"](found[0][-count:])[:, 0]
-    _, ratings = search_poses(frame, draft, count // 2)
-    np.testing.assert_allclose(rated[: count // 2], ratings)
-    assert len(np.unique(rated.round(9))) > 2
 
 
 # -- degraded volumes -----------------------------------------------------------------------------

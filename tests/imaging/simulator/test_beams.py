@@ -104,15 +104,6 @@ def test_echoes_interfere_with_the_phase_of_the_way_there_and_back():
     assert peak(50.0, 50.154) == pytest.approx(peak(50.0) + peak(50.154), rel=0.05)
 
 
-def test_side_lobes_have_the_level_set():
-    acquisition = replace(QUIET, side_lobe_db=-20.0)
-    grid, envelope = render(acquisition, echoes([[0.0, 0.0, 50.0]]))
-    line = envelope.max(axis=(1, 2))
-    away = np.abs(grid.azimuth.start + grid.azimuth.step * np.arange(len(line)))
-    lobe = line[away > 1.1 * math.radians(acquisition.lateral_deg)].max()
-    assert 20 * math.log10(lobe / line.max()) == pytest.approx(-20, abs=2)
-
-
 def slab(level):
     """Attenuating tissue from 36 to 46 mm on one side, without echo: a lattice."""
     n, side, corner = np.array([60, 120, 40]), np.array([30, 60, 10]), np.array([-30, -30, 36.0])
@@ -143,13 +134,6 @@ def change(point, acquisition=QUIET, losses=None):
         for one, lost in ((QUIET, None), (acquisition, losses))
     )
     return 20 * math.log10(other / plain)
-
-
-def test_compensation_amplifies_with_depth():
-    more = replace(QUIET, compensation_db_per_cm_mhz=0.35)
-    for z in (40.0, 60.0):
-        # 0.2 dB/cm/MHz at 5 MHz there and back.
-        assert change([0.0, 0.0, z], more) == pytest.approx(0.2 * z, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -188,3 +172,19 @@ def test_there_is_shadow_behind_dense_tissue_and_nowhere_else():
     points = [[-8.0, 0.0, 60.0], [8.0, 0.0, 60.0], [-5.0, 0.0, 33.0]]
     for point, expected in zip(points, (-20.0 * np.hypot(1, 8 / 60), 0.0, 0.0), strict=True):
         assert change(point, losses=losses) == pytest.approx(expected, abs=1.0)
+
+
+def test_side_lobes_have_the_level_set():
+    acquisition = replace(QUIET, side_lobe_db=-20.0)
+    grid, envelope = render(acquisition, echoes([[0.0, 0.0, 50.0]]))
+    line = envelope.max(axis=(1, 2))
+    away = np.abs(grid.azimuth.start + grid.azimuth.step * np.arange(len(line)))
+    lobe = line[away > 1.1 * math.radians(acquisition.lateral_deg)].max()
+    assert 20 * math.log10(lobe / line.max()) == pytest.approx(-20, abs=2)
+
+
+def test_compensation_amplifies_with_depth():
+    more = replace(QUIET, compensation_db_per_cm_mhz=0.35)
+    for z in (40.0, 60.0):
+        # 0.2 dB/cm/MHz at 5 MHz there and back.
+        assert change([0.0, 0.0, z], more) == pytest.approx(0.2 * z, abs=1e-3)

@@ -1,4 +1,4 @@
-""""""
+"""Simulated volumes: bright leaflets at the true positions, beats, tissue, scan conversion."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import Probe
 from mvest.imaging.simulator.beams import BeamGrid
-from mvest.imaging.simulator.scene import make_heart, make_parts, make_scene
+from mvest.imaging.simulator.scene import make_scene
 from mvest.imaging.simulator.simulate import (
     _displacements,
     compress,
@@ -78,17 +78,6 @@ def test_beats_are_displaced_about_the_truth():
     assert np.mean(seam.frames != plain.frames) > 0.05
 
 
-def test_dropouts_darken_the_share_wanted_of_the_leaflets():
-    rng = np.random.default_rng(0)
-    heart = make_heart(VALVE, PROBE.apex_in_valve, rng)
-    for dropout in (0.0, 0.3):
-        acquisition = replace(SMALL, dropout=dropout, dropout_db=-40.0)
-        leaflet = make_parts(VALVE, heart, acquisition, rng)[0]
-        assert leaflet.material.name == "leaflet"
-        dark = leaflet.sow(rng, 4000)[1] < 0.15
-        assert dark.mean() == pytest.approx(dropout, abs=0.07)
-
-
 def test_tissue_is_as_dense_and_attenuates_as_much_as_set():
     acquisition = replace(SMALL, frequency_mhz=4.0, shadow_db_per_cm=0.0)
     scene = make_scene(VALVE, acquisition, PROBE, np.random.default_rng(0))
@@ -141,13 +130,6 @@ def test_levels_land_where_the_beams_run_in_the_world():
     np.testing.assert_allclose(volume[tuple(index.T)], expected, atol=1.2)
 
 
-def test_log_compression():
-    acquisition = replace(SMALL, dynamic_range_db=60.0, gain_db=6.0)
-    envelope = np.array([10.0 ** (-6 / 20), 10.0 ** (-36 / 20), 10 ** (-66 / 20), 0.0, 100.0])
-    levels = compress(envelope.astype(np.float32), acquisition)
-    np.testing.assert_allclose(levels, [255, 127.5, 0, 0, 255], atol=2e-3)
-
-
 def test_beats_that_are_not_displaced_leave_no_seam():
     # What is stitched from four sub-sectors must be what one sweep gives, but for the noise.
     quiet = replace(STILL, blood_db=-200.0, electronics_db=-200.0, haze_db=-200.0)
@@ -155,3 +137,10 @@ def test_beats_that_are_not_displaced_leave_no_seam():
     swept = simulate_volume(VALVE, replace(quiet, beats=1), PROBE, 1, frames=[0]).frames
     # Where echoes cancel, rounding shows.
     assert np.mean(np.abs(stitched - swept) > 1) < 1e-4
+
+
+def test_log_compression():
+    acquisition = replace(SMALL, dynamic_range_db=60.0, gain_db=6.0)
+    envelope = np.array([10.0 ** (-6 / 20), 10.0 ** (-36 / 20), 10 ** (-66 / 20), 0.0, 100.0])
+    levels = compress(envelope.astype(np.float32), acquisition)
+    np.testing.assert_allclose(levels, [255, 127.5, 0, 0, 255], atol=2e-3)

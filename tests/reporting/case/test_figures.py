@@ -9,15 +9,12 @@ from matplotlib.collections import PolyCollection, QuadMesh
 from mvest.errors import InputError
 from mvest.problem.fields import case_fields
 from mvest.reporting.case.drawing import (
-    BLOOD,
     LINE_PIECES,
-    TISSUE,
     distance_top,
     leak_of,
-    quartered,
 )
 from mvest.reporting.case.figures import case_figure, estimates_figure, frames_figure, shapes_figure
-from mvest.reporting.case.view import case_view, states_of
+from mvest.reporting.case.view import states_of
 from mvest.reporting.figures import ATRIUM, SIDE
 from tests.made_up_closure import made_up_case as case_of_frames
 from tests.reporting.case.made_up_case import COLUMNS, made_up_case
@@ -78,8 +75,6 @@ def test_a_valve_is_turned_the_same_way_however_it_lies(case, fields) -> None:
     [
         ("fitted", np.zeros((2, 5, 3)), "fitted has the shape"),
         ("annulus", np.array([0, 9999]), "annulus has indices outside"),
-        ("chord_tip", np.array([0, 1]), "chord_insertion has the shape"),
-        ("frames", np.array([], dtype=str), "without frames"),
     ],
 )
 def test_arrays_that_do_not_fit_are_named(case, name, value, message) -> None:
@@ -116,23 +111,6 @@ def test_figure_3_draws_the_frame_that_was_shown_to_the_filter_and_greys_the_uns
         assert grey.sum() == touched * pieces(figure.axes[0], fields) > 0
 
 
-def test_figure_3_needs_its_fields(fields, tmp_path) -> None:
-    with pytest.raises(InputError, match="needs the personalised"):
-        case_figure(replace(fields, distance_fitted=None))
-    with pytest.raises(InputError, match=r"none\.npz"):
-        case_figure(tmp_path / "none.npz")
-
-
-def test_a_fitted_valve_without_a_generic_one_is_drawn_alone_in_mm(fields) -> None:
-    near = 1e-6 * fields.distance_fitted
-    figure = case_figure(replace(fields, generic=None, distance_fitted=near))
-    assert len(figure.axes) == 3
-    mean, std = np.nanmean(near[0]), np.nanstd(near[0])
-    title = f"personalised stiffness\n{mean:.1e} ± {std:.1e} mm"
-    assert figure.axes[0].get_title() == title
-    assert figure.axes[2].get_ylabel() == "distance from the observed valve [mm]"
-
-
 def test_scales_end_at_a_round_number_above_all_but_outliers() -> None:
     for largest, top in ((2.1, 2.5), (0.31, 0.35), (5.0, 5.0), (0.0, 1e-3)):
         assert distance_top(np.full(9, largest)) == pytest.approx(top)
@@ -154,15 +132,6 @@ def test_a_valve_with_holes_is_drawn_without_them_on_one_scale(fields) -> None:
     for row in (panels[:3], panels[3:]):
         assert len({(*axes.get_xlim(), *axes.get_ylim()) for axes in row}) == 1
         assert all(axes.get_aspect() == 1.0 for axes in row)
-
-
-def test_triangles_are_split_where_leaflets_are_close() -> None:
-    """Four triangles for one, of the same area and with its colours between the corners."""
-    corner = np.array([[[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]])
-    parts = quartered(corner)
-    area = np.cross(parts[:, 1] - parts[:, 0], parts[:, 2] - parts[:, 0])[:, 2] / 2
-    np.testing.assert_allclose(area, 2.0)
-    np.testing.assert_allclose(parts.mean(axis=(0, 1)), corner.mean(axis=(0, 1)))
 
 
 def marked(axes, marker) -> list[float]:
@@ -195,27 +164,6 @@ def test_every_frame_of_a_case_is_drawn_from_two_sides_on_one_scale(corresponds)
     # Chordae are drawn in every frame whose vertices are those of the reference frame.
     opened, closed, _ = (len(faces(axes).get_paths()) for axes in figure.axes[3:])
     assert (opened == closed) is corresponds
-
-
-def test_positions_of_the_scene_are_rounded_and_in_single_precision(fields) -> None:
-    # Without plotly's script, 480 vertices and 880 triangles in a dozen meshes.
-    markup = str(case_view(fields, NAMES)[0])
-    own = markup[markup.rindex("Plotly.newPlot") :]
-    assert '"f4"' in own
-    assert '"f8"' not in own
-    assert len(own) < 400_000
-
-
-def test_a_slit_of_touching_leaflets_differs_from_a_leak_if_their_reach_is_known(fields):
-    def colours(reach):
-        axes = case_figure(replace(fields, reach_mm=reach)).axes[0]
-        drawn = [mesh.get_array()[mesh.get_array()[..., 3] > 0] for mesh in leaks(axes)]
-        return [{tuple(np.round(colour[:3], 2)) for colour in one} for one in drawn]
-
-    assert colours(None) == []
-    # Nothing touches within no distance, and everything does within the size of the valve.
-    assert colours(0.0) == [{BLOOD}]
-    assert colours(200.0) == [{TISSUE}]
 
 
 def test_the_scene_has_the_gap_in_its_place(fields):

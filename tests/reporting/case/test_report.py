@@ -140,27 +140,6 @@ def test_an_almost_empty_record_has_a_page(case, tmp_path) -> None:
     assert not re.search(r"\b(nan|None)\b", page.text)
 
 
-def test_what_is_not_known_is_left_out(case, tmp_path) -> None:
-    """The closed frame was seen as points."""
-    record, path = case
-    with np.load(path) as stored:
-        arrays = dict(stored)
-    arrays["observed_points_closed"] = arrays.pop("observed")[0, 4:]
-    plain = record.model_dump() | {"alternatives": {}, "innovation": None}
-    plain["unknowns"] = [row | {"truth": None} for row in plain["unknowns"]]
-    for frame in plain["frames"]:
-        frame |= {name: None for name in frame if name.endswith("_to_truth")}
-    del plain["details"]["errors"]
-    written = report(EstimateRecord.model_validate(plain), tmp_path, arrays=arrays)
-    html = written[1].read_text(encoding="utf-8")
-    text = Page(html).text
-    assert "With all nuisances taken as known" not in text
-    assert "true value" not in text
-    assert not re.search(r"\b(nan|None)\b", text)
-    labels = re.findall(r'data-shown="[^"]*">([^<]*)<', html)
-    assert {"closed, observed", "observed (grey) over personalised"} <= set(labels)
-
-
 def test_an_unusable_place_or_file_is_one_clear_error(case, tmp_path) -> None:
     with pytest.raises(InputError, match="no fields of a case"):
         report(case[0], tmp_path, arrays=tmp_path / "none.npz")
