@@ -196,7 +196,6 @@ def test_an_interruption_is_let_through() -> None:
 # --- what is written ----------------------------------------------------------------------------
 
 
-def test_a_text_is_not_lost_for_one_character(tmp_path, capsys):
+def test_a_text_is_not_lost_for_one_character(tmp_path):
     write_atomically(tmp_path / "a.md", "1.5 ± 0.1 MPa, a\ud800b")
     assert (tmp_path / "a.md").read_text(encoding="utf-8") == "1.5 ± 0.1 MPa, a?b"
-    assert "U+D800 cannot be written" in capsys.readouterr().err
