@@ -148,8 +148,7 @@ def sheet_program(folder, **settings):
         len(TINY.points),
         units=("MPa", "MPa"),
         settings={"cells": [2, 2], "observed": [4, 3], "load_steps": 2, **settings},
-        differences=Differences("central", 1e-3, processes=2),
-        reuse=False,
+        differences=Differences(1e-3, processes=2),
     )
 
 
