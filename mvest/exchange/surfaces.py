@@ -1,10 +1,9 @@
 """Surfaces with their regions: VTK, STL, OBJ, PLY and GLB are read, VTP and time series written.
 
-A surface comes from one labelled file or from one file per region. The names of the files carry the
-regions of formats without labels (STL, PLY without a ``region`` property, OBJ without groups):
+A surface comes from one labelled file or from one file per region. STL, OBJ and PLY have no labels:
 ``{anterior: a.stl, posterior: p.stl}``. Coincident vertices are merged in surfaces of several
-files, in STL and GLB files, and in OBJ files whose objects have separate vertices. The triangles
-number the merged vertices, so that two files with the same triangles in the same order correspond.
+files, and in STL, OBJ and GLB files. The triangles number the merged vertices, so that two files
+with the same triangles in the same order correspond.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Surface:
     point_data, cell_data
         Named arrays with n or m rows.
     groups
-        Name of the group or object of each triangle (OBJ, GLB); empty without any.
+        Name of the object of each triangle (GLB); empty without any.
     region
         ``(m,)`` index into the regions of a case; None without labels.
     others
@@ -119,8 +118,8 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
     """Read a surface and the region of each triangle.
 
     The labels are, in this order, the keys of ``files``, the cell data ``region``, the point data
-    ``region`` (a triangle has the label of two of its corners), or the names of groups or objects
-    (OBJ, GLB). A single region needs no labels.
+    ``region`` (a triangle has the label of two of its corners), or the names of objects (GLB). A
+    single region needs no labels.
 
     Parameters
     ----------
@@ -167,19 +166,13 @@ def _not_too_large(file: Path) -> Surface:
 
 
 def _labelled(whole: Surface, regions: Mapping[int, str], suffix: str) -> Surface:
-    surface = replace(whole, region=_labels(whole, regions))
-    region = surface.region
-    apart = False
-    if suffix == ".obj" and region is not None and len(np.unique(region)) > 1:
-        corners = np.column_stack([surface.triangles.ravel(), np.repeat(region, 3)])
-        apart = len(np.unique(corners, axis=0)) == len(np.unique(surface.triangles))
-    if apart or suffix in (".stl", ".glb"):
-        surface = merged(surface)
+    region = _labels(whole, regions)
     if region is not None:
         empty = [name for k, name in enumerate(regions.values()) if k not in region]
         if empty:
             raise GeometryError(f"no triangle belongs to the region {', '.join(empty)}")
-    return surface
+    surface = replace(whole, region=region)
+    return merged(surface) if suffix in (".stl", ".obj", ".glb") else surface
 
 
 def merged(surface: Surface) -> Surface:

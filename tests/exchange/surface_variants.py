@@ -1,13 +1,9 @@
-"""Surface files in all variants that VTK, trimesh, meshio and programs like MeshLab write.
-
-All hold the same three triangles with the labels 1, 2 and 2, so that the reader can be compared
-with what was written. Nothing of the readers takes part.
-"""
+"""Surface files as VTK, trimesh and meshio write them: the same three labelled triangles."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import cycle, product
+from functools import partial
 from pathlib import Path
 
 import meshio
@@ -26,7 +22,7 @@ from vtkmodules.vtkIOLegacy import vtkPolyDataWriter, vtkUnstructuredGridWriter
 from vtkmodules.vtkIOPLY import vtkPLYWriter
 from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
-from tests.exchange.variant import Variant
+from tests.exchange.variant import Variant, each_option
 
 POINTS = np.array([[0.0, 0, 0], [20, 0, 0], [0, 20, 0.5], [20, 20, 0.25], [40, 0, 1]])
 TRIANGLES = np.array([[0, 1, 2], [2, 1, 3], [1, 4, 3]])
@@ -38,8 +34,6 @@ POINT_LABELS = np.array([1, 2, 1, 2, 2])
 WALL = np.array([1.0, 1.25, 1.5, 1.75, 2.0])
 STRIP, LINE = [2, 1, 3, 4], [0, 2, 3, 4]
 """The second and the third triangle; the boundary in part."""
-
-Write = Callable[[Path], object]
 
 
 def vtk_array(values: object, name: str, kind: str = "float64") -> object:
@@ -185,37 +179,7 @@ STL = (
 )
 
 
-def ply(path: Path, form: str, real: str, count: str, more: str = "") -> None:
-    """As the format's description has it: VTK and trimesh write a few of these variants only."""
-    order = ">" if form == "binary big endian" else "<"
-    kinds = {"float": "f4", "double": "f8", "uchar": "u1", "int": "i4"}
-    faces = QUADS if more == "quads" else TRIANGLES.tolist()
-    text = ["ply", f"format {form.replace(' ', '_')} 1.0", "comment made up", "element vertex 5"]
-    text += [f"property {real} {axis}" for axis in "xyz"]
-    text += ["property uchar region"] if more == "labels of points" else []
-    text += [f"property uchar {name}" for name in ("red", "green", "blue") if more == "colours"]
-    name = "vertex_index" if more == "vertex_index" else "vertex_indices"
-    text += [f"element face {len(faces)}", f"property list {count} int {name}"]
-    text += ["property list uchar float texcoord"] if more == "texcoord" else []
-    text += ["property int region"] if more == "labels of faces" else []
-    rows: list[list[tuple[str, object]]] = []
-    for k, point in enumerate(POINTS):
-        rows.append([(real, x) for x in point])
-        rows[-1] += [("uchar", POINT_LABELS[k])] if more == "labels of points" else []
-        rows[-1] += [("uchar", 40 * k)] * 3 if more == "colours" else []
-    for k, face in enumerate(faces):
-        rows.append([(count, len(face)), *(("int", corner) for corner in face)])
-        rows[-1] += [("uchar", 6), *[("float", 0.5)] * 6] if more == "texcoord" else []
-        rows[-1] += [("int", LABELS[k])] if more == "labels of faces" else []
-    head = "\n".join([*text, "end_header\n"]).encode()
-    if form == "ascii":
-        body = "".join(" ".join(f"{x:g}" for _, x in row) + "\n" for row in rows).encode()
-    else:
-        body = b"".join(np.array(x, order + kinds[of]).tobytes() for row in rows for of, x in row)
-    path.write_bytes(head + body)
-
-
-def ply_of_library(path: Path, what: str) -> None:
+def ply(path: Path, what: str) -> None:
     mesh = trimesh.Trimesh(POINTS, TRIANGLES, process=False)
     if what.startswith("trimesh"):
         coloured = what == "trimesh colours"
@@ -237,29 +201,31 @@ PLY = (
 )
 VERTICES = [f"v {x} {y} {z}" for x, y, z in POINTS]
 FACES = [" ".join(str(corner + 1) for corner in row) for row in TRIANGLES]
-GROUPED = ["g anterior", f"f {FACES[0]}", "g posterior", f"f {FACES[1]}", f"f {FACES[2]}"]
 OBJ: dict[str, list[str]] = {
-    "groups": [*VERTICES, *GROUPED],
-    "objects": [*VERTICES, *(line.replace("g ", "o ") for line in GROUPED)],
-    "groups of an object": ["o valve", *VERTICES, *GROUPED],
+    "groups": [*VERTICES, "g anterior", f"f {FACES[0]}", "g posterior", f"f {FACES[1]}",
+               f"f {FACES[2]}"],
     "negative indices": [*VERTICES, *(
         "f " + " ".join(str(corner - 5) for corner in row) for row in TRIANGLES)],
     "quads": [*VERTICES, "f 1 2 4 3", "f 2 5 4"],
-    "texture and normals": [*VERTICES, "vt 0 0", "vn 0 0 1", *(
-        "f " + " ".join(f"{corner}/1/1" for corner in row.split()) for row in FACES)],
-    "colours of points": [*(f"{line} 0.5 0.5 0.5" for line in VERTICES), *GROUPED],
-    "materials and smoothing": ["mtllib a.mtl", *VERTICES, "usemtl red", "s 1", *GROUPED, "s off"],
-    "Latin-1 comment": ["# Segelfläche", *VERTICES, *GROUPED],
+    "texture and normals": [*VERTICES, "vt 0 0", "vt 1 0", "vn 0 0 1", *(
+        f"f {a}/1/1 {b}/2/1 {c}/1/1" for a, b, c in (row.split() for row in FACES))],
+    "colours of points": ["# Segelfläche", *(f"{v} 0.5 0.5 0.5" for v in VERTICES), "usemtl red",
+                          *(f"f {row}" for row in FACES)],
 }  # fmt: skip
 
 
-def obj_of_library(path: Path, what: str) -> None:
-    if what.startswith("VTK"):
+BY_OBJ = ("VTK", "VTK with tabs", "meshio")
+
+
+def obj(path: Path, what: str) -> None:
+    if what in OBJ:
+        path.write_bytes("\n".join(OBJ[what]).encode("latin-1"))
+    elif what == "meshio":
+        meshio.obj.write(path, meshio.Mesh(POINTS, [("triangle", TRIANGLES)]))
+    else:
         saved(vtkOBJWriter(), vtk_data(), path)
         if what == "VTK with tabs":
             path.write_text(path.read_text().replace(" ", "\t"))
-    else:
-        meshio.obj.write(path, meshio.Mesh(POINTS, [("triangle", TRIANGLES)]))
 
 
 def glb(path: Path, what: str) -> None:
@@ -277,46 +243,25 @@ def glb(path: Path, what: str) -> None:
 
 def surface_variants() -> Iterator[Variant]:
     """All of them; those without labels hold ``labels=False``."""
+    types = ("UInt64", "UInt32"), ("LittleEndian", "BigEndian", "BigEndian"), ("Int64", "Int32")
     modes = ("text", "base64", "appended", "appended base64")
-    types = cycle(product(("UInt64", "UInt32"), ("LittleEndian", "BigEndian"), ("Int64", "Int32")))
-    for kind, *way in product(("vtp", "vtu"), modes, COMPRESSION):
-        options = (*way, *next(types))
-        yield Variant(kind.upper(), options, f"a.{kind}", lambda p, o=options: xml(p, *o))
+    for kind, packed in (("vtp", [*COMPRESSION]), ("vtu", [*COMPRESSION][::-1])):
+        for row in each_option(modes, tuple(packed), *types):
+            yield Variant(kind.upper(), row, f"a.{kind}", lambda p, o=row: xml(p, *o))
     for what in ("single precision", "int8 labels", "labels of points", "boundary lines",
                  "triangle strips", "quads"):  # fmt: skip
-        yield Variant("VTP", (what,), "a.vtp", lambda p, w=what: more_xml(p, w))
-    kinds = ("int8", "uint8", "int16", "int32", "int64", "vtkIdType", "float32", "float64")
-    for options in product(("4.2", "5.1"), ("text", "binary"), kinds, ("scalars", "a field")):
-        yield Variant("VTK", options, "a.vtk", lambda p, o=options: legacy(p, *o))
+        yield Variant("VTP", (what,), "a.vtp", partial(more_xml, what=what))
+    forms = ("4.2", "5.1"), ("text", "text", "binary", "binary")
+    kinds = ("int32", "uint8", "int8", "vtkIdType", "int16", "float64", "float32", "int64")
+    for row in each_option(*forms, kinds, ("scalars", "a field", "a field")):
+        yield Variant("VTK", row, "a.vtk", lambda p, o=row: legacy(p, *o))
     others = ("header of 3D Slicer", "boundary lines", "triangle strips", "quads",
               "unstructured grid")  # fmt: skip
-    for options in product(others, ("4.2", "5.1"), ("text", "binary")):
-        yield Variant("VTK", options, "a.vtk", lambda p, o=options: more_legacy(p, *o))
-    for what in STL:
-        yield Variant("STL", (what,), "a.stl", lambda p, w=what: stl(p, w), labels=False)
-    forms = ("ascii", "binary little endian", "binary big endian")
-    for options in product(forms, ("float", "double"), ("uchar", "int")):
-        yield Variant("PLY", options, "a.ply", lambda p, o=options: ply(p, *o), labels=False)
-    for what, form in product(
-        ("labels of points", "labels of faces", "quads", "texcoord", "colours", "vertex_index"),
-        forms,
-    ):
-        yield Variant(
-            "PLY", (what, form), "a.ply", lambda p, w=what, f=form: ply(p, f, "float", "uchar", w),
-            labels="labels" in what,
-        )  # fmt: skip
-    for what in PLY:
-        yield Variant("PLY", (what,), "a.ply", lambda p, w=what: ply_of_library(p, w), labels=False)
-    for what, lines in OBJ.items():
-        text = "\n".join(lines)
-        yield Variant(
-            "OBJ",
-            (what,),
-            "a.obj",
-            lambda p, t=text: p.write_bytes(t.encode("latin-1")),
-            labels="anterior" in text,
-        )
-    for what in ("VTK", "VTK with tabs", "meshio"):
-        yield Variant("OBJ", (what,), "a.obj", lambda p, w=what: obj_of_library(p, w), labels=False)
-    for what in ("one mesh", "objects", "objects that nodes place"):
-        yield Variant("GLB", (what,), "a.glb", lambda p, w=what: glb(p, w), labels="ob" in what)
+    for row in each_option(others, *forms):
+        yield Variant("VTK", row, "a.vtk", lambda p, o=row: more_legacy(p, *o))
+    for make, form, names in ((stl, "STL", STL), (ply, "PLY", PLY), (obj, "OBJ", (*OBJ, *BY_OBJ))):
+        for what in names:
+            file = f"a.{form.lower()}"
+            yield Variant(form, (what,), file, partial(make, what=what), labels=False)
+    for what in ("one mesh", "objects that nodes place"):
+        yield Variant("GLB", (what,), "a.glb", partial(glb, what=what), labels="ob" in what)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 from scipy.spatial.transform import Rotation
 
-from tests.exchange.variant import Variant
+from tests.exchange.variant import Variant, each_option
 
 SHAPE = (3, 16, 17, 21)
 SPACING = np.array([1.5, 1.25, 1.0])
@@ -225,52 +225,36 @@ def philips(
 
 def volume_variants() -> Iterator[Variant]:
     """Images, their times in s, in ms or without unit."""
-    for options in product(("NIfTI-1", "NIfTI-2"), ("uint8", "int16", "float32")):
-        for name in ("a.nii", "a.nii.gz"):
-            yield Variant("NIfTI", (*options, name[1:]), name, lambda p, o=options: nifti(p, *o))
+    kinds = ("uint8", "int16", "float32")
+    for row in each_option(("NIfTI-1", "NIfTI-1", "NIfTI-2"), kinds, (".nii.gz", ".nii")):
+        yield Variant("NIfTI", row, f"a{row[2]}", lambda p, o=row[:2]: nifti(p, *o))
     for what in ("sform only", "qform only", "scaled", "seconds", "3D"):
-        yield Variant(
-            "NIfTI", (what,), "a.nii.gz", lambda p, w=what: nifti(p, "NIfTI-1", "int16", w)
-        )
-    for name, *options in product(
-        ("a.mha", "a.mhd"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
-    ):
-        yield Variant(
-            "MetaImage", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
-            given={"time_unit": "s"} if "4D" in options else {},
-        )  # fmt: skip
-    for name, *options in product(
-        ("a.nrrd", "a.nhdr"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
-    ):
-        yield Variant(
-            "NRRD by ITK", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
-            given={"time_unit": "s"} if "4D" in options else {},
-        )  # fmt: skip
-    for name, *options in product(
-        ("a.seq.nrrd", "a.nhdr"), ("frames first", "frames last"), ("raw", "gzip", "bzip2", "text"),
-        ("uint8", "int16", "float32"),
-    ):  # fmt: skip
-        yield Variant(
-            "NRRD by pynrrd", (name[1:], *options), name, lambda p, o=options: by_pynrrd(p, *o)
-        )
+        how = partial(nifti, version="NIfTI-1", dtype="int16", more=what)
+        yield Variant("NIfTI", (what,), "a.nii.gz", how)
+    packed = ("compressed", "plain", "plain", "compressed")
+    for form, ends in (("MetaImage", (".mha", ".mhd")), ("NRRD by ITK", (".nrrd", ".nhdr"))):
+        for row in each_option(ends, ("4D", "4D", "3D", "3D"), kinds, packed):
+            given = {"time_unit": "s"} if "4D" in row else {}
+            write = lambda p, o=row[1:]: by_itk(p, *o)  # noqa: E731
+            yield Variant(form, row, f"a{row[0]}", write, given=given)
+    axes, packed = ("frames last", "frames first"), ("gzip", "gzip", "raw", "bzip2", "text", "raw")
+    for row in each_option((".seq.nrrd", ".nhdr", ".nhdr"), axes, packed, kinds):
+        yield Variant("NRRD by pynrrd", row, f"a{row[0]}", lambda p, o=row[1:]: by_pynrrd(p, *o))
     for what in ("RAS", "milliseconds", "multivolume", "3D", "slicerio", *TEXT_INDEX):
-        yield Variant(
-            "NRRD", (what,), "a.seq.nrrd", lambda p, w=what: more_nrrd(p, w),
-            given={"frame_interval_s": 0.04} if what in TEXT_INDEX else {},
-        )  # fmt: skip
-    for options in product(("explicit", "implicit"), ("preamble", "bare")):
-        yield Variant(
-            "Philips Cartesian DICOM", options, "a.dcm", lambda p, o=options: philips(p, *o)
-        )
+        given = {"frame_interval_s": 0.04} if what in TEXT_INDEX else {}
+        yield Variant("NRRD", (what,), "a.seq.nrrd", partial(more_nrrd, what=what), given=given)
+    for row in each_option(("explicit", "implicit"), ("preamble", "bare")):
+        yield Variant("Philips Cartesian DICOM", row, "a.dcm", lambda p, o=row: philips(p, *o))
 
 
 def label_variants() -> Iterator[Variant]:
     """Label maps of one frame, or of one that is not empty."""
     for what in ("one layer", "overlapping layers", "an empty layer", "before 4.11"):
-        yield Variant(
-            "Slicer segmentation", (what,), "a.seg.nrrd", lambda p, w=what: segments(p, w)
-        )
-    kinds = ("uint8", "int16", "int64", "float32", "float64")
-    for form, name in (("NRRD", "a.nrrd"), ("MetaImage", "a.mha"), ("NIfTI", "a.nii.gz")):
-        for what in (*kinds, *(("4D in ms", "4D without a unit") if form == "NIfTI" else ())):
-            yield Variant(f"{form} labels", (what,), name, lambda p, w=what: map_of_labels(p, w))
+        yield Variant("Slicer segmentation", (what,), "a.seg.nrrd", partial(segments, what=what))
+    for form, name, kinds in (
+        ("NRRD", "a.nrrd", ("int16", "int64", "float32")),
+        ("MetaImage", "a.mha", ("uint8", "float64")),
+        ("NIfTI", "a.nii.gz", ("uint8", "int64", "4D in ms", "4D without a unit")),
+    ):
+        for what in kinds:
+            yield Variant(f"{form} labels", (what,), name, partial(map_of_labels, what=what))

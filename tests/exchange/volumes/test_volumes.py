@@ -52,13 +52,6 @@ def made(folder: Path, extra: str = "", **changes: str | None) -> Path:
     return path
 
 
-def crlf(folder: Path) -> Path:
-    path = made(folder)
-    head, end, voxels = path.read_bytes().partition(b"\n\n")
-    path.write_bytes((head + end).replace(b"\n", b"\r\n") + voxels)
-    return path
-
-
 def skipped(folder: Path, **skips: str) -> Path:
     skips = {name.replace("_", " "): value for name, value in skips.items()}
     path = made(folder, **{"data file": "a.raw"} | skips)
@@ -81,8 +74,6 @@ SAME: dict[str, Callable[[Path], Path]] = {
     "left, anterior, superior": lambda folder: other(
         folder, **{"space": "LAS", "space directions": directions(0) * LAS,
                    "space origin": v.ORIGIN * LAS}),
-    "the space stated twice": lambda folder: made(folder, "space: left-posterior-superior\n"),
-    "carriage returns": crlf,
     "a line and bytes skipped": lambda folder: skipped(folder, line_skip="1", byte_skip="5"),
 }  # fmt: skip
 
@@ -94,18 +85,16 @@ def test_the_same_volume(tmp_path: Path, what: str) -> None:
     assert found.frames.flags.c_contiguous
 
 
-LEFT: dict[str, Callable[[Path], Path]] = {
-    "NRRD": lambda folder: by_itk(folder / "a.nrrd", direction=v.MIRRORED),
-    "mha": lambda folder: by_itk(folder / "a.mha", direction=v.MIRRORED),
-    "NIfTI": lambda folder: nifti(folder / "a.nii", "NIfTI-1", "uint8", "qform only", v.MIRRORED),
-}
-
-
-@pytest.mark.parametrize("what", LEFT)
-def test_a_left_handed_volume_stays_left_handed(tmp_path: Path, what: str) -> None:
-    unit = {} if what == "NIfTI" else {"time_unit": "s"}
+@pytest.mark.parametrize("kind", ["NRRD", "MetaImage", "NIfTI"])
+def test_a_left_handed_volume_stays_left_handed(tmp_path: Path, kind: str) -> None:
+    if kind == "NIfTI":
+        path = nifti(tmp_path / "a.nii", "NIfTI-1", "uint8", "qform only", v.MIRRORED)
+        found = read(path)
+    else:
+        name = {"NRRD": "a.nrrd", "MetaImage": "a.mha"}[kind]
+        found = read(by_itk(tmp_path / name, direction=v.MIRRORED), time_unit="s")
     expected = VolumeSequence(v.frames(), v.SPACING, v.MIRRORED, v.ORIGIN, EVEN)
-    v.assert_same(read(LEFT[what](tmp_path), **unit), expected)
+    v.assert_same(found, expected)
 
 
 def test_the_hash_is_that_of_all_files(tmp_path: Path) -> None:
@@ -131,21 +120,11 @@ def test_time_as_an_axis_of_the_world(tmp_path: Path) -> None:
     v.assert_same(read(tmp_path / "a.nrrd"), SEQUENCE)
 
 
-def without_times(folder: Path) -> Path:
-    path = nifti(folder / "a.nii", "NIfTI-1", "uint8")
-    content = path.read_bytes()
-    header = nibabel.Nifti1Header(content[:348])
-    header["pixdim"][4] = 0
-    path.write_bytes(header.binaryblock + content[348:])
-    return path
-
-
 PHASES = {"axis 0 index type=": "text", TIMES: "ED%20frame mid ES"}
 UNTIMED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "NRRD": (lambda folder: made(folder, units=None), f"{VALUES}: times without a unit"),
     "phases by name": (lambda folder: made(folder, **PHASES), "index type: no times of frames"),
     "MetaImage": (lambda folder: by_itk(folder / "a.mha"), "ElementSpacing: times without a unit"),
-    "NIfTI of no interval": (without_times, r"pixdim\[4\].*: no times of frames"),
 }
 
 
@@ -252,7 +231,6 @@ def steps(text: str) -> dict[str, str]:
 PLACE, PATH = "space directions", "file in the same folder"
 BAD: dict[str, Bad] = {
     "colour": of_nrrd("kinds", "one grey value", kinds="RGB-color domain domain domain"),
-    "sizes and dimension": of_nrrd("dimension", "3 (one volume) or 4", sizes="3 20 24"),
     "no spacing": of_nrrd(PLACE, "a vector in mm", **{PLACE: None}),
     "no origin": of_nrrd("space origin", "centre of the first voxel", **{"space origin": None}),
     "unknown space": of_nrrd("space", "left-posterior-superior", space="scanner-xyz"),
@@ -260,52 +238,34 @@ BAD: dict[str, Bad] = {
         PLACE, "three, and 'none' for the frames", **{PLACE: "(1,0,0) (0,1,0) (0,0,1) (1,1,0)"}),
     "no right angles": of_nrrd(PLACE, "right angles", **steps("(1,0,0) (0.1,1,0) (0,0,1)")),
     "spacing in cm": of_nrrd(PLACE, "0.05 to 5 mm", **steps("(0.04,0,0) (0,0.04,0) (0,0,0.04)")),
-    "small extent": of_nrrd(PLACE, "20 to 500 mm", **steps("(0.1,0,0) (0,0.1,0) (0,0,0.1)")),
-    "no frames": of_nrrd("sizes", "at least one frame", sizes="0 16 17 21"),
     "origin far away": of_nrrd(
         "space origin", "coordinates in mm", **{"space origin": "(1e6,0,0)"}),
     "space units": of_nrrd(
         "space units", "mm, cm, m or um", **{"space units": '"mm" "inch" "mm"'}),
     "time runs back": of_nrrd(VALUES, "increasing times", **{TIMES: "0 0.05 0.03"}),
     "ms taken for s": of_nrrd(VALUES, "less than 1 s", **{TIMES: "0 30 60"}),
-    "a second between frames": of_nrrd(VALUES, "less than 1 s", **{TIMES: "0 1 2"}),
     "s taken for ms": of_nrrd(VALUES, "at least 0.002 s", units='"ms" "" "" ""'),
     "a time is missing": of_nrrd(VALUES, "each of 3 frames", **{TIMES: "0 0.03"}),
-    "a time is nan": of_nrrd(VALUES, "each of 3 frames", **{TIMES: "0 nan 0.03"}),
-    "percent of a beat": of_nrrd(
-        VALUES, "times in s or ms", units='"%" "" "" ""', **{TIMES: "0 5 10"}),
     "a segmentation": of_nrrd("Segment0_ID", "an image", **{"Segment0_ID=": "Leaf"}),
-    "unknown modality": of_nrrd(
-        "mvest.modality", "ultrasound, ct, mr", **{"mvest.modality=": "pet"}),
     "fewer voxels than bytes": of_nrrd("damaged", "", sizes="3 16 17 20"),
     "data elsewhere": of_nrrd("data file", PATH, **{"data file": "../a.raw"}),
-    "another space": (lambda f: made(f, "space: right-anterior-superior\n"), "header: ", "fields"),
-    "a header without end": (lambda f: made(f, "# more\n" * 200_000), "header: no end in 1048", ""),
     "MetaImage: no spacing": of_metaimage(r"ElementSpacing = .*\n", "", "ElementSpacing"),
     "no offset": of_metaimage(r"Offset = .*\n", "", "Offset"),
-    "a spacing missing": of_metaimage(r"(ElementSpacing = \S+) .*", r"\1", "ElementSpacing"),
     "space and time": of_metaimage(r"(TransformMatrix = .*) 0 1\n", r"\1 0.5 1\n", "Transform"),
     "more voxels": of_metaimage(r"DimSize = 16", "DimSize = 17", "ElementDataFile"),
     "channels": of_metaimage(r"ElementType", "ElementNumberOfChannels = 3\nElementType", "Element"),
     "an offset of data": of_metaimage(r"ElementType", "HeaderSize = 12\nElementType", "HeaderSize"),
-    "a file elsewhere": of_metaimage(r"LOCAL", "../a.raw", "ElementDataFile"),
-    "stated twice": of_metaimage(r"Offset = ", "Offset = 1 2 3 4\nOffset = ", "Offset"),
     "NIfTI: no direction": of_nifti(
         lambda h: h.set_sform(None, "unknown"), "sform_code", "a direction"),
     "two spacings": of_nifti(
         lambda h: h["pixdim"].__setitem__(2, 2.5), "pixdim", "the spacing of sform"),
     "hertz": of_nifti(
         lambda h: h.set_xyzt_units("mm", "hz"), "xyzt_units", "a fourth axis of time"),
-    "longer": of_nifti(
-        lambda h: h.set_data_shape((16, 17, 21, 2)), "data", "bytes that the header"),
     "RGB": of_nifti(lambda h: h.set_data_dtype("RGB"), "data", "no colour"),
-    "two files": of_nifti(lambda h: h.__setitem__("magic", b"ni1"), "magic", "one file"),
     "CT": of_dicom("SOPClassUID", "1.2.840.10008.5.1.4.1.1.2", "SOPClassUID", "3D Slicer"),
     "no slice spacing": of_dicom((0x3001, 0x1003), None, "(3001,1003)", "a number"),
     "no cm": of_dicom("PhysicalUnitsXDirection", 4, "PhysicalUnitsXDirection", "which is cm"),
-    "no frame time": of_dicom("FrameTime", None, "FrameTime", "a number"),
     "two bytes": of_dicom("BitsAllocated", 16, "BitsAllocated", "one grey value of a byte"),
-    "mirrored spacing": of_dicom("PhysicalDeltaX", -0.15, "PhysicalDeltaX", "positive lengths"),
     "more frames than bytes": of_dicom("NumberOfFrames", 4, "PixelData", "22848 bytes"),
 }  # fmt: skip
 
@@ -327,7 +287,7 @@ def test_a_data_file_that_is_a_link_out_of_the_folder_is_refused(tmp_path: Path)
         read(path)
 
 
-@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+@pytest.mark.parametrize("value", [0.0, np.nan])
 def test_a_frame_that_shows_nothing_is_refused(tmp_path: Path, value: float) -> None:
     voxels = v.frames("float32")
     voxels[2] = value
