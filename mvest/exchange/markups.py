@@ -35,24 +35,12 @@ MAX_BYTES = 2**24
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointList:
-    """Points with their labels.
+    """Points with their labels, which may be empty or repeated."""
 
-    Attributes
-    ----------
-    labels : tuple of str
-        One per point; may be empty or repeated.
-    points : (n, 3) mm
-        LPS.
-    kind : str
-        ``"Fiducial"`` (single points), ``"Curve"``, ``"ClosedCurve"``, ``"Line"``, ...
-    unplaced : tuple of str
-        Labels of listed points without a position.
-    """
-
-    labels: tuple[str, ...]
-    points: FloatArray
-    kind: str = "Fiducial"
-    unplaced: tuple[str, ...] = ()
+    labels: tuple[str, ...]  # one per point
+    points: FloatArray  # (n, 3) mm, LPS
+    kind: str = "Fiducial"  # (single points), "Curve", "ClosedCurve", "Line", ...
+    unplaced: tuple[str, ...] = ()  # labels of listed points without a position
 
     @classmethod
     def numbered(cls, name: str, points: FloatArray, kind: str = "Fiducial") -> PointList:

@@ -22,8 +22,8 @@ from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
 Arrays = Mapping[str, NDArray[np.generic]]
-STRIPS, POLYGONS = (6,), (5, 7, 9)
-FLAT = (1, 2, 3, 4, *STRIPS, *POLYGONS)
+POLYGONS = (5, 7, 9)
+FLAT = (1, 2, 3, 4, *POLYGONS)
 """VTK's numbers of cell types; 1 and 2 are single vertices, 3 and 4 lines."""
 STL_HEADER = 84
 STL_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -87,10 +87,7 @@ def _cells(data: Any, count: int) -> tuple[IntArray, IntArray, IntArray]:
 def _triangles(
     points: FloatArray, types: IntArray, sizes: IntArray, corners: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Triangles ``(m, 3)`` of polygons and strips, and the number ``(m,)`` of the cell of each.
-
-    VTK triangulates polygons, but not strips: vtkTriangleFilter 9.7 confuses their cells.
-    """
+    """Triangles ``(m, 3)`` of polygons, and the number ``(m,)`` of the cell of each."""
     polygon = np.isin(types, POLYGONS) & (sizes > 2)
     flat, rows = corners[np.repeat(polygon, sizes)], np.flatnonzero(polygon)
     if (sizes[polygon] != 3).any():
@@ -99,16 +96,7 @@ def _triangles(
         cutter.Update()
         flat = _numpy(cutter.GetOutput().GetPolys().GetConnectivityArray())
         rows = _numpy(cutter.GetOutput().GetCellData().GetArray("row"))
-    parts, cells, ends = [flat.reshape(-1, 3)], [rows], np.cumsum(sizes)
-    for cell in np.flatnonzero(np.isin(types, STRIPS)):
-        strip = corners[ends[cell] - sizes[cell] : ends[cell]]
-        part = np.column_stack([strip[:-2], strip[1:-1], strip[2:]])
-        part[1::2] = part[1::2][:, [1, 0, 2]]  # every second one faces the other way
-        parts.append(part)
-        cells.append(np.full(len(part), cell))
-    rows = np.concatenate(cells)
-    order = np.argsort(rows, kind="stable")
-    return np.concatenate(parts)[order].astype(np.int64), rows[order]
+    return flat.reshape(-1, 3).astype(np.int64), rows
 
 
 def vtk_module(name: str) -> Any:

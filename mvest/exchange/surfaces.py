@@ -49,7 +49,7 @@ class Surface:
     vertices
         ``(n, 3)`` in the unit of the file; finite.
     triangles
-        ``(m, 3)``, also from strips and polygons.
+        ``(m, 3)``, also from polygons.
     point_data, cell_data
         Named arrays with n or m rows.
     groups
@@ -263,8 +263,7 @@ def write_surface(
     Raises
     ------
     InputError, GeometryError
-        Another suffix, points that are not finite, data that do not fit, or a file that cannot be
-        written.
+        Another suffix, points that are not finite, or a file that cannot be written.
     """
     target = Path(path)
     _check_suffix(target, (".vtp",))
@@ -276,13 +275,6 @@ def write_surface(
         {name: np.ascontiguousarray(v, np.int8 if v.dtype == bool else None) for name, v in given}
         for given in ((point_data or {}).items(), (cell_data or {}).items())
     ]
-    for arrays, rows in zip(data, (len(points), len(faces)), strict=True):
-        for name, values in arrays.items():
-            if len(values) != rows or values.dtype.kind not in "iuf":
-                raise InputError(
-                    f"{target}: data {name!r} of shape {values.shape} and type {values.dtype}, "
-                    f"expected {rows} rows of numbers"
-                )
     surface = polydata(points, faces.ravel(), np.full(len(faces), 3), *data)
     if space:
         words = vtk_module("vtkCommonCore").vtkStringArray()
@@ -316,22 +308,13 @@ def write_surface_series(
 
     The states ``NAME_0000.vtp``, ``NAME_0001.vtp``, ... lie next to their index ``NAME.pvd``.
 
-    Raises
-    ------
-    InputError
-        Times do not increase or do not fit the states; as `write_surface`.
+    Raises as `write_surface`.
     """
     index = Path(path)
     _check_suffix(index, (".pvd",))
-    moments = np.asarray(times, dtype=np.float64)
-    if len(states) != len(moments) or not len(states) or (np.diff(moments) <= 0).any():
-        raise InputError(
-            f"{index}: {len(states)} states and times {moments.tolist()}, expected as many, "
-            "increasing, at least one"
-        )
     root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ET.SubElement(root, "Collection")
-    for number, (time, state) in enumerate(zip(moments.tolist(), states, strict=True)):
+    for number, (time, state) in enumerate(zip(map(float, times), states, strict=True)):
         file = index.with_name(f"{index.stem}_{number:04d}.vtp")
         data = (state.point_data, state.cell_data)
         write_surface(file, state.vertices, state.triangles, *data, space="LPS")

@@ -126,11 +126,6 @@ def more_nrrd(path: Path, what: str) -> None:
     elif what == "milliseconds":
         fields["units"] = ["ms", "", "", ""]
         fields["axis 0 index values"] = "0 40 80"
-    elif what == "multivolume":
-        for name in ("labels", "units", "axis 0 index type", "axis 0 index values"):
-            del fields[name]
-        fields["MultiVolume.FrameLabels"] = "0,40,80"
-        fields["MultiVolume.FrameIdentifyingDICOMTagUnits"] = "ms"
     elif what == "phases as text":
         del fields["units"]
         fields |= {"axis 0 index type": "text", "axis 0 index values": "ED mid%20systole ES"}
@@ -147,7 +142,7 @@ def more_nrrd(path: Path, what: str) -> None:
 
 
 def segments(path: Path, what: str) -> None:
-    """A segmentation by slicerio, as Slicer has it since 4.11, or without its keys as before."""
+    """A segmentation by slicerio, as Slicer has written it since 4.11."""
     made = slicerio.create_segmentation(SHAPE[1:], AFFINE)
     for label, name in ((1, "mitral_anterior_leaflet"), (2, "mitral_posterior_leaflet")):
         mask = label_map() == label
@@ -158,19 +153,12 @@ def segments(path: Path, what: str) -> None:
         made["voxels"] = np.stack([made["voxels"], np.zeros_like(made["voxels"])])
         made["segments"].append({"id": "Segment_3", "name": "annulus", "labelValue": 1, "layer": 1})
     slicerio.write_segmentation(str(path), made)
-    if what == "before 4.11":
-        values, fields = nrrd.read(str(path))
-        kept = {k: v for k, v in fields.items() if not k.endswith(("LabelValue", "Layer"))}
-        both = np.stack([values == label for label in (1, 2)]).astype(np.uint8)
-        kept |= {"kinds": ["list", *["domain"] * 3], "space directions": directions(0)}
-        nrrd.write(str(path), both, kept)
 
 
 def map_of_labels(path: Path, what: str) -> None:
     """Labels 1 and 2 in a plain image, or among empty frames."""
     values = label_map()
-    if what in ("int16", "int64", "float32", "float64"):
-        values = values.astype(what)
+    values = values if what.startswith("4D") else values.astype(what)
     if what in ("4D in ms", "4D without a unit"):
         image = nibabel.Nifti1Image(np.stack([values * 0, values, values * 0], 3), RAS @ AFFINE)
         if what == "4D in ms":
@@ -240,7 +228,7 @@ def volume_variants() -> Iterator[Variant]:
     axes, packed = ("frames last", "frames first"), ("gzip", "gzip", "raw", "bzip2", "text", "raw")
     for row in each_option((".seq.nrrd", ".nhdr", ".nhdr"), axes, packed, kinds):
         yield Variant("NRRD by pynrrd", row, f"a{row[0]}", lambda p, o=row[1:]: by_pynrrd(p, *o))
-    for what in ("RAS", "milliseconds", "multivolume", "3D", "slicerio", *TEXT_INDEX):
+    for what in ("RAS", "milliseconds", "3D", "slicerio", *TEXT_INDEX):
         given = {"frame_interval_s": 0.04} if what in TEXT_INDEX else {}
         yield Variant("NRRD", (what,), "a.seq.nrrd", partial(more_nrrd, what=what), given=given)
     for row in each_option(("explicit", "implicit"), ("preamble", "bare")):
@@ -249,7 +237,7 @@ def volume_variants() -> Iterator[Variant]:
 
 def label_variants() -> Iterator[Variant]:
     """Label maps of one frame, or of one that is not empty."""
-    for what in ("one layer", "overlapping layers", "an empty layer", "before 4.11"):
+    for what in ("one layer", "overlapping layers", "an empty layer"):
         yield Variant("Slicer segmentation", (what,), "a.seg.nrrd", partial(segments, what=what))
     for form, name, kinds in (
         ("NRRD", "a.nrrd", ("int16", "int64", "float32")),

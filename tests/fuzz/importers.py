@@ -27,7 +27,7 @@ from mvest.imaging.volume import Modality
 from tests.cases import folders
 from tests.exchange.surfaces import recorded
 from tests.exchange.variants import LABELS, MARKUPS, SURFACES, VOLUMES
-from tests.experiments.studies.made_up import made_up, made_up_estimate
+from tests.experiments.studies.made_up import made_up
 from tests.fuzz.trial import Enter, Makers
 
 REQUEST = RunRequest(
@@ -126,7 +126,7 @@ IMPORTERS: dict[str, tuple[Enter, Makers]] = {
         "VTU: text, LZMA, UInt64, LittleEndian, Int64",
         "VTU: base64, LZ4, UInt32, BigEndian, Int32",
         "VTK: 4.2, text, int32, scalars", "VTK: 5.1, binary, int64, a field",
-        "VTK: 5.1, text, float64, a field", "VTK: triangle strips, 4.2, binary",
+        "VTK: 5.1, text, float64, a field", "VTK: quads, 4.2, binary",
         "STL: VTK text", "STL: VTK binary", "GLB: objects that nodes place",
         "PLY: VTK text", "PLY: VTK little endian", "OBJ: groups", "OBJ: texture and normals",
     )),
@@ -152,10 +152,7 @@ IMPORTERS: dict[str, tuple[Enter, Makers]] = {
         slicerheart, "AnnulusContourPoints.csv", "ValveLandmarkPoints.csv"
     )),
     "record": (read_record, beside(
-        lambda folder: write_record(
-            folder / "result.json", made_up(estimates=(made_up_estimate(),))
-        ),
-        "result.json",
+        lambda folder: write_record(folder / "result.json", made_up()), "result.json"
     )),
     "answer": (
         lambda path: read_answer(path.parent, REQUEST),

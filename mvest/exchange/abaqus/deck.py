@@ -1,6 +1,6 @@
 """Abaqus input decks (``.inp``) in the form of Texas TriValve: one instance, one step.
 
-Read are nodes, shells (``S4R``, ``S3``) and trusses (``T3D2``), their sets and sections, Ogden
+Read are nodes, shells (``S4R``) and trusses (``T3D2``), their sets and sections, Ogden
 materials, amplitudes, and the step with its duration, constrained nodes and pressure. A deck that
 generates nodes or elements, has a moved instance, or includes other files is refused. Other
 keywords are ignored.
@@ -24,7 +24,7 @@ from mvest.errors import InputError, MvestError
 from mvest.reading.text import MAX_NUMBER, one_line, read_bytes
 from mvest.typing import FloatArray, IntArray
 
-CORNERS = {"S4R": 4, "S3": 3, "T3D2": 2}
+CORNERS = {"S4R": 4, "T3D2": 2}
 """Nodes of the elements that are read."""
 _REFUSED = {
     *("INCLUDE", "NGEN", "NCOPY", "NFILL", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "TRANSFORM"),
@@ -57,24 +57,6 @@ class _Block:
 class Deck:
     """The content of a deck; nodes and elements are numbered from 0 in its order.
 
-    Attributes
-    ----------
-    nodes : list of list
-        ``(n, 3)``.
-    cells : list of list
-        Nodes of each element: 4 of a shell (a triangle repeats the last), 2 of a truss.
-    sets : dict
-        NSET or ELSET -> name in capitals -> increasing numbers.
-    sections : list of tuple
-        Elements, material, and thickness (mm) of shells or cross section (mm^2) of trusses, 0 if
-        not given. Later sections of an element override earlier ones.
-    ogden : dict
-        Material -> ``(t, 2)`` mu (MPa) and alpha of each term.
-    pressures : list of tuple
-        Elements, pressure (MPa) against their normals, and its amplitude.
-    period : float
-        s, of the step.
-
     Raises
     ------
     InputError
@@ -82,13 +64,17 @@ class Deck:
     """
 
     def __init__(self, path: Path) -> None:
-        self.nodes: list[list[float]] = []
-        self.cells: list[list[int]] = []
+        self.nodes: list[list[float]] = []  # (n, 3)
+        self.cells: list[list[int]] = []  # nodes of each element: 4 of a shell, 2 of a truss
+        # NSET or ELSET -> name in capitals -> increasing numbers
         self.sets: dict[str, dict[str, IntArray]] = {"NSET": {}, "ELSET": {}}
+        # Elements, material, and thickness (mm) or cross section (mm^2), 0 if not given. Later
+        # sections of an element override earlier ones.
         self.sections: list[tuple[IntArray, str, float]] = []
-        self.ogden: dict[str, FloatArray] = {}
+        self.ogden: dict[str, FloatArray] = {}  # material -> (t, 2) mu (MPa) and alpha
+        # Elements, pressure (MPa) against their normals, and its amplitude
         self.pressures: list[tuple[IntArray, float, str]] = []
-        self.period = 0.0
+        self.period = 0.0  # s, of the step
         self._labels: dict[str, dict[int, int]] = {"NSET": {}, "ELSET": {}}
         self._surfaces: dict[str, list[tuple[IntArray, float]]] = defaultdict(list)
         self._amplitudes: dict[str, tuple[FloatArray, FloatArray]] = {}
@@ -176,7 +162,6 @@ class Deck:
                 if kind not in CORNERS:
                     raise InputError(f"type {one_line(kind, 20)}, expected {', '.join(CORNERS)}")
                 nodes = self._labelled("ELSET", block, 1 + CORNERS[kind], len(self.cells))
-                nodes = nodes if kind != "S3" else nodes[:, [0, 1, 2, 2]]
                 self.cells.extend([known[label] for label in row] for row in nodes.tolist())
             case "NSET" | "ELSET":
                 self._add_set(key, block.option(key), self._numbers_of(key, block.words))

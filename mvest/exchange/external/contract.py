@@ -182,24 +182,13 @@ class _Message(BaseModel):
 
 
 class RunRequest(_Message):
-    """The request of one run, as ``request.json`` holds it.
+    """The request of one run, as ``request.json`` holds it."""
 
-    Attributes
-    ----------
-    parameters : tuple of RequestParameter, (p,)
-    points : int
-        Number of observed points.
-    jacobian : bool
-        Whether derivatives are of use.
-    settings : mapping
-        Whatever else the program needs; plain data.
-    """
-
-    parameters: tuple[RequestParameter, ...] = Field(min_length=1)
-    points: int = Field(ge=1)
+    parameters: tuple[RequestParameter, ...] = Field(min_length=1)  # (p,)
+    points: int = Field(ge=1)  # number of observed points
     length_unit: Literal["mm"] = "mm"
-    jacobian: bool = True
-    settings: dict[str, Any] = {}
+    jacobian: bool = True  # whether derivatives are useful
+    settings: dict[str, Any] = {}  # plain data for the program
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,7 +1,5 @@
 """Requests and responses as files; a damaged response is refused with the file and the row."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -74,9 +72,3 @@ def test_a_damaged_answer_is_refused(tmp_path, file, content, message):
         read_answer(tmp_path, REQUEST)
     assert message in str(error.value)
     assert len(str(error.value)) < 300
-
-
-def test_a_damaged_request_is_refused(tmp_path):
-    (tmp_path / "request.json").write_text(json.dumps(REQUEST.model_dump() | {"parameters": []}))
-    with pytest.raises(InputError, match=r"parameters: .*at least 1"):
-        read_request(tmp_path / "request.json")
