@@ -93,7 +93,7 @@ def neighbour_file(path: Path, where: str, name: str) -> Path:
 
 def _check_length(where: str, found: int, sizes: Any, dtype: np.dtype[Any]) -> None:
     expected = int(np.prod(sizes, dtype=object)) * dtype.itemsize
-    words = f"the {expected} bytes that the header says"
+    words = f"the {expected} bytes that the header states"
     check(found == expected, where, f"{found} bytes", words)
 
 

@@ -132,7 +132,7 @@ def _write(stream: Any, tree: Any) -> None:
 
 
 def _read(stream: Any) -> Any:
-    """Read what `_write` wrote.
+    """Read a tree that `_write` has written.
 
     Raises
     ------

@@ -30,7 +30,6 @@ from mvest.typing import FloatArray, IntArray
 Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
 SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply", ".vtk", ".glb")
-REGION_PREFIX = "region."
 MERGE_TOLERANCE = 1e-5
 """Merge distance over the diagonal of the bounding box (0.5 µm on 50 mm)."""
 MAX_TRIANGLES = 500_000
@@ -297,7 +296,7 @@ def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray
     """Cell data with the labels, and an indicator per region that carries its name."""
     result: dict[str, NDArray[np.generic]] = {"region": region}
     for number, name in enumerate(names):
-        result[REGION_PREFIX + name] = (region == number).astype(np.int8)
+        result[f"region.{name}"] = (region == number).astype(np.int8)
     return result
 
 

@@ -151,13 +151,7 @@ def read_labels(path: Path | str) -> LabelMap:
 
 
 def sequence_path(path: Path | str) -> Path:
-    """The path, which must end in ``.seq.nrrd``.
-
-    Raises
-    ------
-    InputError
-        Another name.
-    """
+    """The path; raises an InputError unless it ends in ``.seq.nrrd``."""
     target = Path(path)
     if not target.name.endswith(".seq.nrrd") or target.name == ".seq.nrrd":
         raise InputError(f"{target}: name {target.name!r}, expected one that ends in .seq.nrrd")

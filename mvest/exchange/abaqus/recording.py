@@ -152,7 +152,7 @@ def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArra
         raise InputError("no chordae: expected elements of type T3D2, each in a section")
     anchors = np.intersect1d(np.setdiff1d(edges, leaflets), deck.held)
     if not anchors.size:
-        raise InputError("no node of the chordae is held, so no papillary muscle is known")
+        raise InputError("no chord node is constrained, so the papillary muscles are unknown")
     anchor, insertion, length, share = trace_cables(nodes, edges, anchors, leaflets)
     # The family of a cable is the section of the first truss at its insertion.
     ends, first = np.unique(edges, return_index=True)

@@ -39,15 +39,13 @@ EXPONENT = 4.0
 
 @dataclass(frozen=True, slots=True)
 class FebioOptions:
-    """What the case does not state, and choices in FEBio.
+    """Values that the case does not state, and choices in FEBio.
 
     Attributes
     ----------
     E_f, ratio : tuple of float, optional
         MPa and E_f over E_perp of each leaflet, in the order of the case's regions; generic by
         default.
-    nu, reading : float, str
-        Poisson ratio and its option (A or C).
     pressure_mmHg : float, optional
         By default that of the closed frame.
     columns, rows : int
@@ -71,8 +69,6 @@ class FebioOptions:
 
     E_f: tuple[float, ...] | None = None
     ratio: tuple[float, ...] | None = None
-    nu: float = 0.488
-    reading: str = "A"
     pressure_mmHg: float | None = None
     columns: int = 24
     rows: int = 4
@@ -127,8 +123,7 @@ def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
             )
         chosen[what] = list(map(float, values))
     settings = {
-        name: TissueSettings(ratio, options.nu, options.reading)
-        for name, ratio in zip(names, chosen["ratio"], strict=True)
+        name: TissueSettings(ratio) for name, ratio in zip(names, chosen["ratio"], strict=True)
     }
     pressure = options.pressure_mmHg
     if pressure is None:

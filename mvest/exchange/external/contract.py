@@ -39,7 +39,6 @@ from mvest.typing import FloatArray
 
 REQUEST, POINTS = "request.json", "points.csv"
 RESPONSE, OBSERVATION, JACOBIAN = "response.json", "observation.csv", "jacobian.csv"
-ANSWERS = (RESPONSE, OBSERVATION, JACOBIAN)
 OUTPUT, ERRORS = "stdout.txt", "stderr.txt"
 COORDINATES = ("x", "y", "z")
 MAX_JSON_SIZE = 1_000_000
@@ -111,11 +110,6 @@ class Command:
             )
         if shutil.which(program) is None:
             raise ConfigurationError(f"program {program!r} is not found or not executable")
-
-    def run(self, folder: Path) -> str:
-        """Run the program in ``folder``; return why it failed, or an empty text."""
-        with self.started(folder) as ended:
-            return ended()
 
     @contextlib.contextmanager
     def started(self, folder: Path) -> Iterator[Callable[[], str]]:
@@ -279,13 +273,7 @@ def read_points(file: Path, count: int | None = None) -> FloatArray:
 
 
 def write_points(file: Path, points: FloatArray) -> None:
-    """Write positions ``(n, 3)`` mm as a table ``x,y,z``.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written.
-    """
+    """Write positions ``(n, 3)`` mm as a table ``x,y,z``; raises as `write_request`."""
     write_columns(file, COORDINATES, points.tolist())
 
 

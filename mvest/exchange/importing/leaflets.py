@@ -43,7 +43,7 @@ CLOSED_AT = 0.35
 
 @dataclass(frozen=True, slots=True)
 class LeafletsOptions:
-    """What a label map or surfaces do not state.
+    """Values that a label map or surfaces do not state.
 
     Attributes
     ----------
@@ -305,7 +305,7 @@ def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) ->
         low, high = options.thickness_range_mm
         thin, thick = (100 * np.mean(outside) for outside in (thickness < low, thickness > high))
         derived.append(
-            f"thickness: kept between {low:g} mm ({thin:.0f} % of the vertices are thinner) and "
+            f"thickness: clipped to {low:g} mm ({thin:.0f} % of the vertices are thinner) and "
             f"{high:g} mm ({thick:.0f} % are thicker, up to {thickness.max():.1f} mm)"
         )
         thickness = np.clip(thickness, low, high)

@@ -42,7 +42,7 @@ _Seen: TypeAlias = tuple[SeenPhase, Role]
 
 @dataclass(frozen=True, slots=True)
 class SlicerheartOptions:
-    """What a folder of SlicerHeart does not state.
+    """Values that a folder of SlicerHeart does not state.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Folders of SlicerHeart: the words of a file's name say what it holds.
+"""Folders of SlicerHeart: the words in a file's name identify its content.
 
 ValveBatchExport begins every name with ``SCENE_VALVE_frame_N_PHASE`` (``ValveBatchExportRules/
 base.py``). The rest has changed: leaflet surfaces were ``mitral_anterior_leaflet`` in April 2026,

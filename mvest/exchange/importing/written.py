@@ -1,4 +1,4 @@
-"""What all importers share: checks of options, sides and frames, and the case itself.
+"""Shared by all importers: checks of options, sides and frames, and the case itself.
 
 A case is written as a folder and read by the usual rules.
 """

@@ -17,6 +17,11 @@ def python(code: str, *arguments: str, **settings) -> Command:
     return Command((sys.executable, "-I", "-S", "-c", code, *arguments), **settings)
 
 
+def run(command: Command, folder: Path) -> str:
+    with command.started(folder) as ended:
+        return ended()
+
+
 def said(folder: Path) -> list:
     return json.loads((folder / "stdout.txt").read_text())
 
@@ -25,7 +30,7 @@ def test_placeholders_are_filled_once_even_if_the_folder_looks_like_one(tmp_path
     folder = tmp_path / "{request}; rm"
     folder.mkdir()
     command = python(SHOW, "{folder}", "a={request}", "{here}", environment={"LAW": "a;b $HOME"})
-    assert command.run(folder) == ""
+    assert run(command, folder) == ""
     arguments, place, law = said(folder)
     assert arguments == [str(folder), f"a={folder / 'request.json'}", str(Path.cwd())]
     assert (place, law) == (str(folder), "a;b $HOME")
@@ -41,7 +46,7 @@ def test_a_program_that_takes_too_long_is_stopped_with_its_children(tmp_path):
         "sys.stderr.write('step 1 of 9\\n'); sys.stderr.flush(); time.sleep(60)"
     )
     began = time.monotonic()
-    reason = python(code, time_limit_s=0.4).run(tmp_path)
+    reason = run(python(code, time_limit_s=0.4), tmp_path)
     assert time.monotonic() - began < 10
     assert reason == "stopped at the time limit of 0.4 s; its last words: step 1 of 9"
     time.sleep(1.5)
@@ -51,16 +56,16 @@ def test_a_program_that_takes_too_long_is_stopped_with_its_children(tmp_path):
 def test_what_an_ended_program_leaves_behind_is_stopped(tmp_path):
     child = "import time, pathlib; time.sleep(0.8); pathlib.Path('late').touch()"
     code = f"import subprocess, sys; subprocess.Popen([sys.executable, '-S', '-c', {child!r}])"
-    assert python(code).run(tmp_path) == ""
+    assert run(python(code), tmp_path) == ""
     time.sleep(1.2)
     assert not (tmp_path / "late").exists()
 
 
 def test_the_end_of_a_crashed_program_is_told_with_its_last_words(tmp_path):
     lines = "import sys; [print('line', k, file=sys.stderr) for k in range(9)]; sys.exit(3)"
-    reason = python(lines).run(tmp_path)
+    reason = run(python(lines), tmp_path)
     assert reason == "exit status 3; its last words: line 5 | line 6 | line 7 | line 8"
-    reason = python("import os; os.kill(os.getpid(), 11)").run(tmp_path)
+    reason = run(python("import os; os.kill(os.getpid(), 11)"), tmp_path)
     assert reason == "killed by signal 11 (SIGSEGV)"
 
 

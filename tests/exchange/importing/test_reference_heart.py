@@ -79,7 +79,7 @@ def test_it_is_an_anatomy_that_is_in_order_and_says_what_is_assumed(case, tmp_pa
     np.testing.assert_array_equal(back.surface.vertices, case.surface.vertices)
     assert back.source == "whose heart"
     said = " ".join(back.derived)
-    for word in ("papillary tips", "thickness: kept between", "assumed closure", "smoothed"):
+    for word in ("papillary tips", "thickness: clipped to", "assumed closure", "smoothed"):
         assert word in said
 
 

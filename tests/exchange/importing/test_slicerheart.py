@@ -149,14 +149,6 @@ def test_the_atrial_side_is_taken_before_closed_segments(folder, case):
     refused(folder, "anterior leaflet: a closed surface, expected one side", GeometryError)
 
 
-def test_of_several_surfaces_of_a_leaflet_one_word_chooses(folder, case):
-    for file in folder.glob("*_atrial_*"):
-        shutil.copy(file, file.with_name(file.name.replace("_atrial", "_atrial_smooth")))
-    refused(folder, r"2 surfaces of the anterior leaflet \(.*\), expected one; only=WORD takes")
-    found = import_slicerheart(folder, replace(OPTIONS, only="smooth"))
-    assert np.array_equal(found.surface.vertices, case.surface.vertices)
-
-
 def refused(folder, words, kind=InputError, options=OPTIONS):
     with pytest.raises(kind, match=words) as caught:
         import_slicerheart(folder, options)

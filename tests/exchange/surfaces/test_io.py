@@ -11,6 +11,9 @@ from mvest.exchange.surfaces import (
     write_surface,
     write_surface_series,
 )
+from tests.valve.conftest import shapes
+
+__all__ = ["shapes"]
 
 
 def test_a_surface_comes_back_exactly(shapes, tmp_path):
