@@ -97,18 +97,14 @@ def test_fcsv_with_quotes_and_without_a_header(tmp_path: Path) -> None:
     assert found.labels == ("A, P", "AL")
     np.testing.assert_array_equal(found.points, TIPS.points * [-1, -1, 1])
 
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
+    whole = HEAD.format("5", "LPS") + COLUMNS + ROWS
+    for old, new, words in (
         ("= LPS", "= IJK", "CoordinateSystem"),
-        ("4,5,", "4,x,", "position of point 2"),
-    ],
-)
-def test_a_bad_fcsv_is_refused_in_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:
-    (tmp_path / "F.fcsv").write_text((HEAD.format("5", "LPS") + COLUMNS + ROWS).replace(old, new))
-    with pytest.raises(InputError, match=rf"F\.fcsv: {words}"):
-        read_markups(tmp_path / "F.fcsv")
+        ("4,5,", "4,x,", "position of"),
+    ):
+        (tmp_path / "F.fcsv").write_text(whole.replace(old, new))
+        with pytest.raises(InputError, match=rf"F\.fcsv: {words}"):
+            read_markups(tmp_path / "F.fcsv")
 
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:

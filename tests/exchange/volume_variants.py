@@ -32,9 +32,9 @@ AFFINE = np.eye(4)
 AFFINE[:3, :3], AFFINE[:3, 3] = DIRECTION * SPACING, ORIGIN
 
 
-def frames(dtype: str = "uint8", shape: tuple[int, ...] = SHAPE) -> np.ndarray:
+def frames(dtype: str = "uint8") -> np.ndarray:
     """Voxels ``(T, I, J, K)``, different wherever axes are swapped."""
-    return np.random.default_rng(7).integers(0, 100, shape).astype(dtype)
+    return np.random.default_rng(7).integers(0, 100, SHAPE).astype(dtype)
 
 
 def label_map() -> np.ndarray:
@@ -44,7 +44,7 @@ def label_map() -> np.ndarray:
     return result
 
 
-def itk(values: np.ndarray, step: float = 0.04, direction=DIRECTION) -> SimpleITK.Image:
+def itk(values: np.ndarray, direction=DIRECTION) -> SimpleITK.Image:
     """An image of three or, with time as the last, of four axes."""
     image = SimpleITK.GetImageFromArray(
         np.ascontiguousarray(values.transpose(*range(values.ndim - 3), -1, -2, -3)), isVector=False
@@ -52,7 +52,7 @@ def itk(values: np.ndarray, step: float = 0.04, direction=DIRECTION) -> SimpleIT
     more, size = values.ndim - 3, values.ndim
     whole = np.eye(size)
     whole[:3, :3] = direction
-    image.SetSpacing([*SPACING, *[step] * more])
+    image.SetSpacing([*SPACING, *[0.04] * more])
     image.SetOrigin([*ORIGIN, *[0.0] * more])
     image.SetDirection(whole.ravel().tolist())
     return image
@@ -90,9 +90,6 @@ def directions(axis: int | None) -> np.ndarray:
     return rows if axis is None else np.insert(rows, axis, np.nan, axis=0)
 
 
-TEXT_INDEX = ("phases as text", "slicerio with phases as text")
-
-
 def header(axis: int | None, encoding: str = "gzip") -> dict[str, Any]:
     """As 3D Slicer writes it, with the frames along an axis or without frames."""
     result: dict[str, Any] = {
@@ -126,9 +123,6 @@ def more_nrrd(path: Path, what: str) -> None:
     elif what == "milliseconds":
         fields["units"] = ["ms", "", "", ""]
         fields["axis 0 index values"] = "0 40 80"
-    elif what == "phases as text":
-        del fields["units"]
-        fields |= {"axis 0 index type": "text", "axis 0 index values": "ED mid%20systole ES"}
     elif what.startswith("slicerio"):
         made = [{"voxels": frame, "ijkToLPS": AFFINE} for frame in values]
         times: dict[str, Any] = {"index_values": list(map(str, TIMES))}
@@ -175,11 +169,9 @@ PHILIPS = "1.2.840.113543.6.6.1.3.10002"
 """Class of Philips Cartesian DICOM: 3D echo over time in private fields, lengths in cm."""
 
 
-def dataset(shape: tuple[int, ...] = SHAPE, before: bytes = b"") -> Dataset:
+def dataset() -> Dataset:
     """As QLAB exports it; voxels of the class have no direction but their own axes."""
-    values = frames(shape=shape)
-    count, i, j, k = shape
-    data = Dataset()
+    data, (count, i, j, k) = Dataset(), SHAPE
     data.SOPClassUID, data.Modality, data.FrameTime = PHILIPS, "US", "40"
     data.PhysicalUnitsXDirection = data.PhysicalUnitsYDirection = 3
     data.PhysicalDeltaX, data.PhysicalDeltaY, _ = SPACING / 10
@@ -189,8 +181,7 @@ def dataset(shape: tuple[int, ...] = SHAPE, before: bytes = b"") -> Dataset:
     data.add_new((0x3001, 0x0010), "LO", "Philips3D")
     for element, kind, value in ((1, "UL", k), (2, "US", 3), (3, "FD", SPACING[2] / 10)):
         data.add_new((0x3001, 0x1000 + element), kind, value)
-    voxels = before + values.transpose(0, 3, 2, 1).tobytes()
-    data.add_new((0x7FE0, 0x0010), "OB", voxels + b"\0" * (len(voxels) % 2))
+    data.add_new((0x7FE0, 0x0010), "OB", frames().transpose(0, 3, 2, 1).tobytes())
     return data
 
 
@@ -228,8 +219,8 @@ def volume_variants() -> Iterator[Variant]:
     axes, packed = ("frames last", "frames first"), ("gzip", "gzip", "raw", "bzip2", "text", "raw")
     for row in each_option((".seq.nrrd", ".nhdr", ".nhdr"), axes, packed, kinds):
         yield Variant("NRRD by pynrrd", row, f"a{row[0]}", lambda p, o=row[1:]: by_pynrrd(p, *o))
-    for what in ("RAS", "milliseconds", "3D", "slicerio", *TEXT_INDEX):
-        given = {"frame_interval_s": 0.04} if what in TEXT_INDEX else {}
+    for what in ("RAS", "milliseconds", "3D", "slicerio", "slicerio with phases as text"):
+        given = {"frame_interval_s": 0.04} if "phases" in what else {}
         yield Variant("NRRD", (what,), "a.seq.nrrd", partial(more_nrrd, what=what), given=given)
     for row in each_option(("explicit", "implicit"), ("preamble", "bare")):
         yield Variant("Philips Cartesian DICOM", row, "a.dcm", lambda p, o=row: philips(p, *o))

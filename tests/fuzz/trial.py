@@ -43,7 +43,7 @@ class Bench:
         """How the valid files are read, which also loads what the importer needs."""
 
     def damaged(self, seed: int) -> tuple[int, bytes]:
-        """The number of a valid file, and bytes made of it; both follow from a number."""
+        """The number of a valid file, and damaged bytes of it."""
         draw = random.Random(seed)
         number = draw.randrange(len(self.paths))
         return number, changed(self.contents[number], draw)

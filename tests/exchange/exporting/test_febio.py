@@ -12,9 +12,6 @@ from mvest.exchange.exporting.febio import FebioOptions, export_febio
 from mvest.mechanics.forces.cables import cable_force
 from tests.cases.folders import template_case
 
-# The order of the sections in which FEBio can resolve names: materials before domains, the mesh
-# before all that acts on it.
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
