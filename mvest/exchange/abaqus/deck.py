@@ -1,6 +1,6 @@
 """Abaqus input decks (``.inp``) in the form of Texas TriValve: one instance, one step.
 
-Read are nodes, shells (``S4R``) and trusses (``T3D2``), their sets and sections, Ogden
+Read are nodes, shells (``S4R``, ``S3``) and trusses (``T3D2``), their sets and sections, Ogden
 materials, amplitudes, and the step with its duration, constrained nodes and pressure. A deck that
 generates nodes or elements, has a moved instance, or includes other files is refused. Other
 keywords are ignored.
@@ -24,7 +24,7 @@ from mvest.errors import InputError, MvestError
 from mvest.reading.text import MAX_NUMBER, one_line, read_bytes
 from mvest.typing import FloatArray, IntArray
 
-CORNERS = {"S4R": 4, "T3D2": 2}
+CORNERS = {"S4R": 4, "S3": 3, "T3D2": 2}
 """Nodes of the elements that are read."""
 _REFUSED = {
     *("INCLUDE", "NGEN", "NCOPY", "NFILL", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "TRANSFORM"),
@@ -65,7 +65,7 @@ class Deck:
 
     def __init__(self, path: Path) -> None:
         self.nodes: list[list[float]] = []  # (n, 3)
-        self.cells: list[list[int]] = []  # nodes of each element: 4 of a shell, 2 of a truss
+        self.cells: list[list[int]] = []  # nodes: 4 of a shell (S3 repeats the last), 2 of a truss
         # NSET or ELSET -> name in capitals -> increasing numbers
         self.sets: dict[str, dict[str, IntArray]] = {"NSET": {}, "ELSET": {}}
         # Elements, material, and thickness (mm) or cross section (mm^2), 0 if not given. Later
@@ -162,6 +162,7 @@ class Deck:
                 if kind not in CORNERS:
                     raise InputError(f"type {one_line(kind, 20)}, expected {', '.join(CORNERS)}")
                 nodes = self._labelled("ELSET", block, 1 + CORNERS[kind], len(self.cells))
+                nodes = nodes if kind != "S3" else nodes[:, [0, 1, 2, 2]]
                 self.cells.extend([known[label] for label in row] for row in nodes.tolist())
             case "NSET" | "ELSET":
                 self._add_set(key, block.option(key), self._numbers_of(key, block.words))

@@ -361,7 +361,9 @@ def _split(vertices: FloatArray, quads: IntArray, on_rim: IntArray) -> tuple[Int
     by_02 = np.where(ear.any(axis=1), ear[:, 0] | ear[:, 2], first <= second)[:, None]
     one = np.where(by_02, quads[:, [0, 1, 2]], quads[:, [0, 1, 3]])
     two = np.where(by_02, quads[:, [0, 2, 3]], quads[:, [1, 2, 3]])
-    return np.vstack([one, two]), np.tile(np.arange(len(quads)), 2)
+    triangles = np.vstack([one, two])
+    proper = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    return triangles[proper], np.tile(np.arange(len(quads)), 2)[proper]
 
 
 def _group_anchors(path: FloatArray) -> tuple[FloatArray, IntArray]:

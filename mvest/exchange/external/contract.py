@@ -214,13 +214,7 @@ def write_request(folder: Path, request: RunRequest, points: FloatArray | None =
 
 
 def read_request(file: Path) -> RunRequest:
-    """Read ``request.json`` (for the program).
-
-    Raises
-    ------
-    InputError
-        The file is no request of this format.
-    """
+    """Read ``request.json`` (for the program); raises an InputError if it is no request."""
     return validated(RunRequest, read_mapping(file, MAX_JSON_SIZE), str(file))
 
 

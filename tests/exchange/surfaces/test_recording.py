@@ -1,6 +1,7 @@
 """The reader of recorded closures on a small made-up one, and on the real one if it is here."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,21 @@ def test_an_ear_quad_is_cut_from_its_corner(tmp_path):
     assert len(found.free_edge) == ROUND + 2
 
 
+def test_triangles_among_quads(tmp_path, recording):
+    path = write(tmp_path, skirt())
+    text = path.read_text()
+    first = re.search(r"ELSET=septal_Quads\n(\d+),(\d+),(\d+),(\d+),(\d+)\n", text)
+    label, a, b, c, d = first.groups()
+    split = (
+        f"ELSET=septal_Quads\n*Element, type=S3, elset=septal_Quads\n{label},{a},{b},{c}\n"
+        f"9000,{a},{c},{d}\n*Element, type=S4R, elset=septal_Quads\n"
+    )
+    path.write_text(text.replace(first.group(), split))
+    found, whole = read(tmp_path).valve.surface, recording.valve.surface
+    assert found.areas.sum() == pytest.approx(whole.areas.sum())
+    assert np.bincount(found.region).tolist() == [192, 192, 192]
+
+
 def stiffness(leaflet, strain):
     area, pairs = OGDEN[leaflet]
     values = np.array([float(word) for word in pairs.split(",")])
@@ -136,7 +152,7 @@ def test_contradictions(tmp_path, change, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("type=T3D2", "type=B31", r"line \d+, \*ELEMENT: type B31, expected S4R, T3D2"),
+        ("type=T3D2", "type=B31", r"line \d+, \*ELEMENT: type B31, expected S4R, S3, T3D2"),
         ("*Nset, nset=Rim\n1,", "*Ngen, nset=Rim\n1,", r"\*NGEN: is not read"),
         ("*Nset, nset=Rim", "*Nset, nset=Rand", "no node set 'Rim'; there are ALL"),
         (".65, 5\n", "", "shells without a section that states a thickness"),
