@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
@@ -61,14 +61,13 @@ class ModelSettings:
     apart: bool = False  # FILE is run as a program instead, with the request and its folder
     settings: dict[str, Any] = field(default_factory=dict)  # passed to the model unchanged
     environment: dict[str, str] = field(default_factory=dict)  # added to this process's
-    # Runs are repeated after a change of these files and folders, or of those in the command.
+    # The result depends on these files and folders, and on those in the command.
     inputs: Annotated[tuple[str, ...], Reads(contents)] = ()
     time_limit_s: TimeLimit = 600.0  # of one run
-    differences: str = "central"  # or forward, or none: the program must give jacobian.csv
+    differences: Literal["central", "none"] = "central"  # none: it must give jacobian.csv
     relative_step: Tolerance = 1e-3  # of a parameter
     floor: Annotated[float, within(0, 1e12, "", "in the units of any model")] = 0.0  # if it is zero
     processes: Annotated[Processes, NOT_HASHED] = 1  # simultaneous runs
-    reuse: bool = True  # of finished runs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,10 +144,9 @@ def model_of(
             "external.command is not given; expected the program and its arguments, such as "
             '[python,"{here}/solve.py","{request}","{folder}"]'
         )
-    differences = None
-    if source.differences != "none":
-        steps = source.relative_step, source.floor, source.processes
-        differences = Differences(source.differences, *steps)
+    steps = source.relative_step, source.floor, source.processes
+    if missing := [path for path in source.inputs if not Path(path).exists()]:
+        raise ConfigurationError(f"external.inputs: cannot read {', '.join(missing)}")
     return ProcessModel(
         Command(command, source.environment, source.time_limit_s),
         folder / "runs" if about.folder is None else Path(about.folder),
@@ -157,9 +155,7 @@ def model_of(
         units=about.units or None,
         points=None if about.points is None else _points(about.points, "points"),
         settings=settings,
-        differences=differences,
-        reuse=source.reuse,
-        inputs=tuple(map(Path, source.inputs)),
+        differences=None if source.differences == "none" else Differences(*steps),
     )
 
 
@@ -210,7 +206,7 @@ def run(job: Job[Settings]) -> Result:
         record = record.model_copy(update={"unknowns": unknowns})
         whole: dict[str, Any] = {"data": source, "model": name}
         if isinstance(model, ProcessModel):
-            whole |= {"runs": model.runs, "served again": model.reused}
+            whole["runs"] = model.runs
         rows += [{**whole, **{key: row.get(key) for key in COLUMNS}} for row in record.rows()]
         estimates.append(record)
     return Result(
@@ -256,7 +252,7 @@ def check_external(values: Values, folder: Path) -> str:
     derivatives = "by differences, the program gives none"
     by: FloatArray | str = "it is a function"
     if isinstance(model, ProcessModel) and model.own_jacobian:
-        by = model.by_differences(m, found.y)
+        by = model.by_differences(m)
     if not isinstance(model, ProcessModel) or model.own_jacobian:
         derivatives = f"the model's own; not compared with differences: {by}"
     if not isinstance(by, str):

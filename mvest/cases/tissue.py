@@ -121,8 +121,8 @@ def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
     if name not in seen.point_data:
         listed = ", ".join(sorted(seen.point_data)) or "none"
         raise InputError(
-            f"the reference surface has no point data {name!r}; found {listed} (only .vtp, .vtu, "
-            ".vtk and .ply hold any)"
+            f"the reference surface has no point data {name!r}; found {listed} (only .vtp, .vtu "
+            "and .vtk hold any)"
         )
     values = np.asarray(seen.point_data[name], dtype=np.float64).reshape(len(seen.vertices), -1)
     if values.shape[1] != components:

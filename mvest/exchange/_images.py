@@ -8,7 +8,6 @@ header: SimpleITK accepts some truncated files.
 from __future__ import annotations
 
 import gzip
-import re
 import struct
 import zlib
 from collections.abc import Callable, Mapping
@@ -94,7 +93,7 @@ def neighbour_file(path: Path, where: str, name: str) -> Path:
 
 def _check_length(where: str, found: int, sizes: Any, dtype: np.dtype[Any]) -> None:
     expected = int(np.prod(sizes, dtype=object)) * dtype.itemsize
-    words = f"the {expected} bytes that the header says"
+    words = f"the {expected} bytes that the header states"
     check(found == expected, where, f"{found} bytes", words)
 
 
@@ -155,11 +154,12 @@ def nifti(path: Path, begin: bytes) -> Opened:
 # MetaImage is LPS in mm; the fourth spacing is the time between frames, without a unit. ITK invents
 # missing fields, and voxels of damaged compressed data.
 
-METAIMAGE_SYNONYMS = {
-    **dict.fromkeys(("Position", "Origin"), "Offset"),
-    **dict.fromkeys(("Rotation", "Orientation"), "TransformMatrix"),
-    "ElementByteOrderMSB": "BinaryDataByteOrderMSB",
-}
+METAIMAGE_FIELDS = (
+    ("ElementSpacing",),
+    ("Offset", "Position", "Origin"),
+    ("TransformMatrix", "Rotation", "Orientation"),
+)
+"""Required fields, each with the names under which ITK reads it."""
 
 
 def metaimage(path: Path, head: bytes) -> Opened:
@@ -167,30 +167,10 @@ def metaimage(path: Path, head: bytes) -> Opened:
 
     itk: Any = SimpleITK
     end = head.find(b"\n", head.index(b"ElementDataFile")) + 1 or len(head)
-    fields: dict[str, str] = {}
-    for line in head[:end].decode(errors="replace").splitlines():
-        name, _, value = (word.strip() for word in line.partition("="))
-        name = METAIMAGE_SYNONYMS.get(name, name)
-        same = fields.setdefault(name, value) == value
-        check(same, name, f"{fields[name]!r} and {value!r}", "one value")
-
-    def numbers(name: str, count: int) -> FloatArray:
-        value = required(fields, name, f"{count} numbers")
-        plain = re.fullmatch(r"[-+\d.eE\s]+", value, re.ASCII) and len(value.split()) == count
-        check(plain, name, repr(value), f"{count} numbers")
-        return np.array(value.split(), dtype=np.float64)
-
-    n = int(numbers("NDims", 1)[0])
-    check(n in (3, 4), "NDims", n, "3 (one volume) or 4 (volumes over time)")
-    spacing, origin = numbers("ElementSpacing", n), numbers("Offset", n)
-    direction = numbers("TransformMatrix", n * n).reshape(n, n).T
-    sizes = [*numbers("DimSize", n).astype(int), 1][:4]
-    unit = np.allclose(np.linalg.norm(direction, axis=0), 1, rtol=0, atol=1e-3)
-    check(unit, "TransformMatrix", fields["TransformMatrix"], "unit vectors")
-    alone = n == 3 or direction[3].tolist() == direction[:, 3].tolist() == [0, 0, 0, 1]
-    check(alone, "TransformMatrix", direction[-1], "the fourth axis to be time alone")
-    check(spacing.min() > 0, "ElementSpacing", fields["ElementSpacing"], "positive numbers")
-    check(fields.get("HeaderSize", "0") == "0", "HeaderSize", fields.get("HeaderSize"), "0")
+    lines = head[:end].decode(errors="replace").splitlines()
+    fields = {name.strip(): value.strip() for name, _, value in (k.partition("=") for k in lines)}
+    for names in METAIMAGE_FIELDS:
+        check(any(name in fields for name in names), names[0], "not stated", "numbers")
     reader = itk.ImageFileReader()
     reader.SetImageIO("MetaImageIO")
     reader.SetFileName(str(path))
@@ -198,11 +178,20 @@ def metaimage(path: Path, head: bytes) -> Opened:
         reader.ReadImageInformation()
     except RuntimeError as error:
         raise fault("header", "damaged", "fields that SimpleITK reads") from error
+    n = reader.GetDimension()
+    check(n in (3, 4), "NDims", n, "3 (one volume) or 4 (volumes over time)")
+    sizes = [*reader.GetSize(), 1][:4]
+    spacing, origin = np.array(reader.GetSpacing()), np.array(reader.GetOrigin())
+    direction = np.reshape(reader.GetDirection(), (n, n))
+    unit = np.allclose(np.linalg.norm(direction, axis=0), 1, rtol=0, atol=1e-3)
+    check(unit, "TransformMatrix", direction, "unit vectors")
+    alone = n == 3 or direction[3].tolist() == direction[:, 3].tolist() == [0, 0, 0, 1]
+    check(alone, "TransformMatrix", direction[-1], "the fourth axis to be time alone")
+    check(spacing.min() > 0, "ElementSpacing", fields["ElementSpacing"], "positive numbers")
+    check(fields.get("HeaderSize", "0") == "0", "HeaderSize", fields.get("HeaderSize"), "0")
     channels = reader.GetNumberOfComponents()
     check(channels == 1, "ElementNumberOfChannels", channels, "one grey value, no colour or vector")
     dtype = itk.GetArrayFromImage(itk.Image([1, 1, 1], reader.GetPixelID())).dtype
-    if dtype.itemsize > 1:
-        required(fields, "BinaryDataByteOrderMSB", "the order of bytes")
     name = fields["ElementDataFile"]
     local = name.upper() == "LOCAL"
     source = path if local else neighbour_file(path, "ElementDataFile", name)

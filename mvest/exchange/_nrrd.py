@@ -2,9 +2,9 @@
 
 Format: https://teem.sourceforge.net/nrrd/format.html. 3D Slicer puts the axis of frames first
 (``kinds: list domain domain domain``) or last, and their times into ``axis N index values``
-(developer guide, "Sequences") or, of a multivolume, ``MultiVolume.FrameLabels``. Lengths are mm
-unless ``space units`` says otherwise, as in Slicer. ITK writes a volume over time as four axes of
-``space dimension: 4`` without a space; it is LPS.
+(developer guide, "Sequences"). Lengths are mm unless ``space units`` states another unit, as in
+Slicer. ITK writes a volume over time as four axes of ``space dimension: 4`` without a space; it is
+LPS.
 """
 
 from __future__ import annotations
@@ -49,8 +49,6 @@ MAX_LINES = 1000
 KINDS_OF_SPACE = ("domain", "space", *UNSTATED)
 KINDS_OF_FRAMES = ("list", "time", "range", "domain", *UNSTATED)
 IMAGE_NODE = "vtkMRMLScalarVolumeNode"
-FRAME_LABELS = "MultiVolume.FrameLabels"
-FRAME_UNIT = "MultiVolume.FrameIdentifyingDICOMTagUnits"
 
 
 def nrrd_file(path: Path, head: bytes) -> Opened:
@@ -154,17 +152,16 @@ def _times(fields: Mapping[str, Any], axis: int, count: int) -> tuple[str, Float
     """The field of the times of frames, the times if stated, and their unit."""
     unit = _words(fields, "units")[axis]
     unit = "" if unit in UNSTATED else unit
-    for field in (*(f"axis {number} index values" for number in (axis, 0, 3)), FRAME_LABELS):
+    for field in (f"axis {number} index values" for number in (axis, 0, 3)):
         kind = field.replace("values", "type")
         if field not in fields:
             continue
-        if kind != field and fields.get(kind, "numeric") != "numeric":
+        if fields.get(kind, "numeric") != "numeric":
             return kind, None, ""
         try:
-            values = np.array([float(word) for word in fields[field].replace(",", " ").split()])
+            return field, np.array([float(word) for word in fields[field].split()]), unit
         except ValueError as error:
             raise fault(field, error, "numbers") from error
-        return field, values, fields.get(FRAME_UNIT, unit)
     step = fields.get("spacings", [])
     if len(step) > axis and np.isfinite(step[axis]):
         return "spacings", step[axis] * np.arange(count), unit
@@ -176,21 +173,14 @@ def _times(fields: Mapping[str, Any], axis: int, count: int) -> tuple[str, Float
 
 
 def _segments(fields: Mapping[str, Any], layers: int) -> tuple[Segment, ...]:
-    """The segments of 3D Slicer.
-
-    Before 4.11 each segment had a separate layer and the label 1, and neither was written
-    (developer guide, "Segmentations").
-    """
+    """The segments of 3D Slicer 4.11 or newer (developer guide, "Segmentations")."""
     found = (re.match(r"Segment(\d{1,4})_", key, re.ASCII) for key in fields)
     segments = []
     for n in sorted({int(match[1]) for match in found if match}):
         own = {key: fields.get(f"Segment{n}_{key}", "") for key in ("Name", "ID", "Tags")}
         whole = []
-        for key, missing, end in (
-            ("LabelValue", 1 if layers > 1 else n + 1, 2**31),
-            ("Layer", n if layers > 1 else 0, layers),
-        ):
-            word = str(fields.get(f"Segment{n}_{key}", missing))
+        for key, end in (("LabelValue", 2**31), ("Layer", layers)):
+            word = str(fields.get(f"Segment{n}_{key}", "not stated"))
             fits = re.fullmatch(r"\d{1,10}", word, re.ASCII) and int(word) < end
             check(fits, f"Segment{n}_{key}", repr(word), f"a number from 0 to {end - 1}")
             whole.append(int(word))

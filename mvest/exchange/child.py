@@ -46,19 +46,10 @@ def in_child(
     memory_gb: float = MEMORY_GB,
     seconds: float = SECONDS,
 ) -> Any:
-    """Return ``function(path, *arguments)``, computed in the child.
+    """Return ``function(path, *arguments)``, computed in the child within limits.
 
-    Parameters
-    ----------
-    function : callable
-        A function of a module of `mvest.exchange` that returns a tree of dict (keys are str), list,
-        str, int, float, bool, None and NumPy arrays of numbers; tuples become lists.
-    path : Path
-        The file.
-    *arguments : object
-        Further arguments that JSON can hold.
-    memory_gb, seconds : float
-        Limits of this call.
+    The function is one of a module. It returns a tree of dict (keys are str), list, str, int,
+    float, bool, None and NumPy arrays of numbers; tuples become lists. JSON can hold the arguments.
 
     Raises
     ------
@@ -141,7 +132,7 @@ def _write(stream: Any, tree: Any) -> None:
 
 
 def _read(stream: Any) -> Any:
-    """Read what `_write` wrote.
+    """Read a tree that `_write` has written.
 
     Raises
     ------

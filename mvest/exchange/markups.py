@@ -29,32 +29,18 @@ SCHEMA = (
 )
 TO_LPS = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
 MM_PER = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
-FCSV_AXES = {**TO_LPS, "0": TO_LPS["RAS"], "1": TO_LPS["LPS"]}
-"""Numbers before Slicer 4.11."""
 FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label"
 MAX_BYTES = 2**24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointList:
-    """Points with their labels.
+    """Points with their labels, which may be empty or repeated."""
 
-    Attributes
-    ----------
-    labels : tuple of str
-        One per point; may be empty or repeated.
-    points : (n, 3) mm
-        LPS.
-    kind : str
-        ``"Fiducial"`` (single points), ``"Curve"``, ``"ClosedCurve"``, ``"Line"``, ...
-    unplaced : tuple of str
-        Labels of listed points without a position.
-    """
-
-    labels: tuple[str, ...]
-    points: FloatArray
-    kind: str = "Fiducial"
-    unplaced: tuple[str, ...] = ()
+    labels: tuple[str, ...]  # one per point
+    points: FloatArray  # (n, 3) mm, LPS
+    kind: str = "Fiducial"  # (single points), "Curve", "ClosedCurve", "Line", ...
+    unplaced: tuple[str, ...] = ()  # labels of listed points without a position
 
     @classmethod
     def numbered(cls, name: str, points: FloatArray, kind: str = "Fiducial") -> PointList:
@@ -170,7 +156,7 @@ class _File(BaseModel):
 def _read_fcsv(source: Path) -> PointList:
     text = read_bytes(source, MAX_BYTES).decode("utf-8-sig", "replace")
     head = dict(re.findall(r"(?m)^#[ \t]*(\w+)[ \t]*=(.*)$", text))
-    if (axes := head.get("CoordinateSystem", "RAS").strip()) not in FCSV_AXES:
+    if (axes := head.get("CoordinateSystem", "RAS").strip()) not in TO_LPS:
         raise InputError(f"{source}: CoordinateSystem: {one_line(axes, 40)}, expected LPS or RAS")
     columns = [name.strip() for name in head.get("columns", FCSV_COLUMNS).split(",")]
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
@@ -181,4 +167,4 @@ def _read_fcsv(source: Path) -> PointList:
             labels.append(one_line(row.get("label") or "", 80))
     except (InputError, csv.Error) as error:
         raise InputError(f"{source}: position of point {len(points) + 1}: {error}") from error
-    return PointList(tuple(labels), np.reshape(points, (-1, 3)) * FCSV_AXES[axes])
+    return PointList(tuple(labels), np.reshape(points, (-1, 3)) * TO_LPS[axes])

@@ -1,8 +1,7 @@
 """Mesh files of other programs as VTK objects; runs in the child (`mvest.exchange.child`).
 
-VTK reads its own formats, trimesh GLB. STL, OBJ and PLY are read here: VTK accepts truncated STL
-files, and drops the groups of OBJ files and the properties of PLY files; trimesh reads no binary
-PLY files that mix triangles and quadrilaterals.
+VTK reads its own formats and OBJ, trimesh PLY and GLB. STL is read here, because VTK accepts
+truncated STL files.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,8 @@ from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
 Arrays = Mapping[str, NDArray[np.generic]]
-STRIPS, POLYGONS = (6,), (5, 7, 9)
-FLAT = (1, 2, 3, 4, *STRIPS, *POLYGONS)
+POLYGONS = (5, 7, 9)
+FLAT = (1, 2, 3, 4, *POLYGONS)
 """VTK's numbers of cell types; 1 and 2 are single vertices, 3 and 4 lines."""
 STL_HEADER = 84
 STL_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -88,10 +87,7 @@ def _cells(data: Any, count: int) -> tuple[IntArray, IntArray, IntArray]:
 def _triangles(
     points: FloatArray, types: IntArray, sizes: IntArray, corners: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Triangles ``(m, 3)`` of polygons and strips, and the number ``(m,)`` of the cell of each.
-
-    VTK triangulates polygons, but not strips: vtkTriangleFilter 9.7 confuses their cells.
-    """
+    """Triangles ``(m, 3)`` of polygons, and the number ``(m,)`` of the cell of each."""
     polygon = np.isin(types, POLYGONS) & (sizes > 2)
     flat, rows = corners[np.repeat(polygon, sizes)], np.flatnonzero(polygon)
     if (sizes[polygon] != 3).any():
@@ -100,16 +96,7 @@ def _triangles(
         cutter.Update()
         flat = _numpy(cutter.GetOutput().GetPolys().GetConnectivityArray())
         rows = _numpy(cutter.GetOutput().GetCellData().GetArray("row"))
-    parts, cells, ends = [flat.reshape(-1, 3)], [rows], np.cumsum(sizes)
-    for cell in np.flatnonzero(np.isin(types, STRIPS)):
-        strip = corners[ends[cell] - sizes[cell] : ends[cell]]
-        part = np.column_stack([strip[:-2], strip[1:-1], strip[2:]])
-        part[1::2] = part[1::2][:, [1, 0, 2]]  # every second one faces the other way
-        parts.append(part)
-        cells.append(np.full(len(part), cell))
-    rows = np.concatenate(cells)
-    order = np.argsort(rows, kind="stable")
-    return np.concatenate(parts)[order].astype(np.int64), rows[order]
+    return flat.reshape(-1, 3).astype(np.int64), rows
 
 
 def vtk_module(name: str) -> Any:
@@ -150,6 +137,12 @@ def polydata(
             column.SetName(name)
             data.AddArray(column)
     return result
+
+
+def _of_triangles(points: NDArray[Any], corners: NDArray[Any]) -> Any:
+    """A vtkPolyData of points ``(n, 3)`` and triangles, or their concatenated corners."""
+    flat = corners.ravel().astype(np.int64)
+    return polydata(points.astype(np.float64), flat, np.full(len(flat) // 3, 3))
 
 
 def _arrays(data: Any) -> dict[str, Any]:
@@ -217,124 +210,25 @@ def _stl(path: Path) -> tuple[Any, list[str]]:
     else:
         raise InputError(f"{len(content)} bytes, expected {whole} for {count} triangles")
     points = corners.reshape(-1, 3)
-    return polydata(points, np.arange(len(points)), np.full(len(points) // 3, 3)), []
-
-
-def _obj(path: Path) -> tuple[Any, list[str]]:
-    """An OBJ file with the names of its groups, or else of its objects."""
-    points: list[tuple[float, float, float]] = []
-    corners: list[int] = []
-    sizes: list[int] = []
-    groups: dict[str, list[str]] = {"g": [], "o": []}
-    now = {"g": "", "o": ""}
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-    for line in text.splitlines():
-        word, *rest = line.partition("#")[0].split() or [""]
-        if word == "v":
-            x, y, z, *_ = rest
-            points.append((float(x), float(y), float(z)))
-        elif word == "f":
-            face = [int(corner.split("/")[0]) for corner in rest]
-            # Numbers start at 1; negative ones count back from the last vertex so far.
-            corners += [k - 1 if k >= 0 else len(points) + k for k in face]
-            sizes.append(len(face))
-            for kind, name in now.items():
-                groups[kind].append(name)
-        elif word in now:
-            now[word] = " ".join(rest)
-    named = groups["g"] if any(groups["g"]) else groups["o"]
-    surface = polydata(
-        np.array(points).reshape(-1, 3),
-        np.array(corners, dtype=np.int64),
-        np.array(sizes, dtype=np.int64),
-    )
-    return surface, named if any(named) else []
-
-
-_PLY_TYPES = {"char": "i1", "uchar": "u1", "int": "i4", "uint": "u4", "float": "f4"}
-"""Types whose names NumPy does not know, or reads as larger ones."""
-_PLY_ORDER: dict[str, Literal["=", "<", ">"]] = {
-    "ascii": "=",
-    "binary_little_endian": "<",
-    "binary_big_endian": ">",
-}
+    return _of_triangles(points, np.arange(len(points))), []
 
 
 def _ply(path: Path) -> tuple[Any, list[str]]:
-    """A PLY file with the properties of its vertices and faces."""
-    head, mark, body = path.read_bytes().partition(b"end_header")
-    lines = [line.split() for line in head.decode("latin-1").splitlines()]
-    form = next((words[1] for words in lines if words[:1] == ["format"]), "none")
-    if not mark or lines[:1] != [["ply"]] or form not in _PLY_ORDER:
-        raise InputError(f"damaged or no PLY file: format {form}, expected {', '.join(_PLY_ORDER)}")
-    body = body.partition(b"\n")[2]
-    if form == "ascii":  # from here on as if all numbers were binary doubles
-        body = np.array(body.split(), dtype="f8").tobytes()
-    elements: dict[str, tuple[int, list[tuple[str, list[np.dtype[Any]]]]]] = {}
-    for words in lines:
-        if words[:1] == ["element"]:
-            elements[words[1]] = (int(words[2]), [])
-        elif words[:1] == ["property"]:
-            kinds = [_PLY_TYPES.get(word, word) for word in words[1:-1] if word != "list"]
-            kinds = ["f8"] * len(kinds) if form == "ascii" else kinds
-            types = [np.dtype(kind).newbyteorder(_PLY_ORDER[form]) for kind in kinds]
-            list(elements.values())[-1][1].append((words[-1], types))
-    tables: dict[str, dict[str, NDArray[Any]]] = {}
-    at = 0
-    for name, (count, properties) in elements.items():
-        tables[name], at = _ply_columns(body, at, count, properties)
-    if form == "ascii" and at < len(body):
-        raise InputError(f"holds {(len(body) - at) // 8} numbers more than its header says")
-    vertex, face = tables.get("vertex", {}), tables.get("face", {})
-    if not {"x", "y", "z"} <= set(vertex):
-        raise InputError("no element vertex with x, y and z")
-    name = "vertex_index" if "vertex_index" in face else "vertex_indices"
-    none = np.zeros(0, dtype=np.int64)
-    single = [
-        {key: v for key, v in table.items() if f"{key} size" not in table and key[-5:] != " size"}
-        for table in (vertex, face)
-    ]
-    return polydata(
-        np.column_stack([single[0].pop(axis).astype(np.float64) for axis in "xyz"]),
-        face.get(name, none).astype(np.int64),
-        face.get(f"{name} size", none).astype(np.int64),
-        *single,
-    ), []
+    """The points and faces of a PLY file by trimesh, which accepts truncated text."""
+    from trimesh.exchange.ply import load_ply
 
-
-def _ply_columns(
-    body: bytes, at: int, count: int, properties: list[tuple[str, list[np.dtype[Any]]]]
-) -> tuple[dict[str, NDArray[Any]], int]:
-    """Columns of an element, and the offset of the next element.
-
-    A list has two columns: its lengths (``NAME size``) and its concatenated values. Runs of rows
-    with lists of equal length are read together.
-    """
-    runs: list[NDArray[Any]] = []
-    ahead = 16
-    while count:
-        fields: list[tuple[str, np.dtype[Any], tuple[int, ...]]] = []
-        for name, types in properties:
-            shape: tuple[int, ...] = ()
-            if len(types) == 2:
-                size = np.frombuffer(body, types[0], 1, at + np.dtype(fields).itemsize)[0]
-                fields.append((f"{name} size", types[0], ()))
-                shape = (int(size),)
-            fields.append((name, types[-1], shape))
-        row = np.dtype(fields)
-        rows = min(count, ahead, (len(body) - at) // row.itemsize)
-        if not rows:
-            raise InputError(f"ends {count} rows too early")
-        table = np.frombuffer(body, row, rows, at)
-        sizes = [table[name] == table[name][0] for name, _, _ in fields if name[-5:] == " size"]
-        alike = np.all(sizes, axis=0) if sizes else np.ones(rows, dtype=np.bool_)
-        run = rows if alike.all() else int(np.argmin(alike))
-        ahead = 2 * ahead if run == rows else 16
-        runs.append(table[:run])
-        at, count = at + run * row.itemsize, count - run
-    names = (runs[0].dtype.names or ()) if runs else ()
-    columns = {name: np.concatenate([run[name].ravel() for run in runs]) for name in names}
-    return {k: v.astype(v.dtype.newbyteorder("=")) for k, v in columns.items()}, at
+    content = path.read_bytes()
+    found = load_ply(io.BytesIO(content), fix_texture=False, skip_materials=True)
+    points, faces = (np.asarray(found[name]) for name in ("vertices", "faces"))
+    head = content.partition(b"end_header")[0]
+    counts = dict(re.findall(rb"(?m)^element (vertex|face) (\d+)\s*$", head))
+    wanted = [int(counts.get(name, 0)) for name in (b"vertex", b"face")]
+    if len(points) != wanted[0] or len(faces) < wanted[1]:  # a polygon is several triangles
+        raise InputError(
+            f"{len(points)} vertices and {len(faces)} triangles, expected {wanted[0]} vertices and "
+            f"{wanted[1]} faces"
+        )
+    return _of_triangles(points, faces), []
 
 
 def _glb(path: Path) -> tuple[Any, list[str]]:
@@ -366,16 +260,15 @@ def _glb(path: Path) -> tuple[Any, list[str]]:
             if part.metadata["from_gltf_primitive"]:  # one of several of its node
                 node = str(scene.graph.transforms.parents[node])
             names += [str(geometry) if node.isdecimal() else node] * len(part.faces)
-    corners = np.concatenate(faces).ravel()
-    return polydata(np.concatenate(points), corners, np.full(len(names), 3)), names
+    return _of_triangles(np.concatenate(points), np.concatenate(faces)), names
 
 
 _READERS: dict[str, Callable[[Path], tuple[Any, list[str]]]] = {
     ".vtk": partial(_vtk, module="vtkIOLegacy", name="vtkGenericDataObjectReader"),
     ".vtp": partial(_vtk, module="vtkIOXML", name="vtkXMLPolyDataReader"),
     ".vtu": partial(_vtk, module="vtkIOXML", name="vtkXMLUnstructuredGridReader"),
+    ".obj": partial(_vtk, module="vtkIOGeometry", name="vtkOBJReader"),
     ".stl": _stl,
-    ".obj": _obj,
     ".ply": _ply,
     ".glb": _glb,
 }

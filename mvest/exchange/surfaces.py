@@ -1,10 +1,9 @@
 """Surfaces with their regions: VTK, STL, OBJ, PLY and GLB are read, VTP and time series written.
 
-A surface comes from one labelled file or from one file per region. The names of the files carry the
-regions of formats without labels (STL, PLY without a ``region`` property, OBJ without groups):
+A surface comes from one labelled file or from one file per region. STL, OBJ and PLY have no labels:
 ``{anterior: a.stl, posterior: p.stl}``. Coincident vertices are merged in surfaces of several
-files, in STL and GLB files, and in OBJ files whose objects have separate vertices. The triangles
-number the merged vertices, so that two files with the same triangles in the same order correspond.
+files, and in STL, OBJ and GLB files. The triangles number the merged vertices, so that two files
+with the same triangles in the same order correspond.
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ from mvest.typing import FloatArray, IntArray
 Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
 SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply", ".vtk", ".glb")
-REGION_PREFIX = "region."
 MERGE_TOLERANCE = 1e-5
 """Merge distance over the diagonal of the bounding box (0.5 µm on 50 mm)."""
 MAX_TRIANGLES = 500_000
@@ -50,11 +48,11 @@ class Surface:
     vertices
         ``(n, 3)`` in the unit of the file; finite.
     triangles
-        ``(m, 3)``, also from strips and polygons.
+        ``(m, 3)``, also from polygons.
     point_data, cell_data
         Named arrays with n or m rows.
     groups
-        Name of the group or object of each triangle (OBJ, GLB); empty without any.
+        Name of the object of each triangle (GLB); empty without any.
     region
         ``(m,)`` index into the regions of a case; None without labels.
     others
@@ -119,8 +117,8 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
     """Read a surface and the region of each triangle.
 
     The labels are, in this order, the keys of ``files``, the cell data ``region``, the point data
-    ``region`` (a triangle has the label of two of its corners), or the names of groups or objects
-    (OBJ, GLB). A single region needs no labels.
+    ``region`` (a triangle has the label of two of its corners), or the names of objects (GLB). A
+    single region needs no labels.
 
     Parameters
     ----------
@@ -167,19 +165,13 @@ def _not_too_large(file: Path) -> Surface:
 
 
 def _labelled(whole: Surface, regions: Mapping[int, str], suffix: str) -> Surface:
-    surface = replace(whole, region=_labels(whole, regions))
-    region = surface.region
-    apart = False
-    if suffix == ".obj" and region is not None and len(np.unique(region)) > 1:
-        corners = np.column_stack([surface.triangles.ravel(), np.repeat(region, 3)])
-        apart = len(np.unique(corners, axis=0)) == len(np.unique(surface.triangles))
-    if apart or suffix in (".stl", ".glb"):
-        surface = merged(surface)
+    region = _labels(whole, regions)
     if region is not None:
         empty = [name for k, name in enumerate(regions.values()) if k not in region]
         if empty:
             raise GeometryError(f"no triangle belongs to the region {', '.join(empty)}")
-    return surface
+    surface = replace(whole, region=region)
+    return merged(surface) if suffix in (".stl", ".obj", ".glb") else surface
 
 
 def merged(surface: Surface) -> Surface:
@@ -270,8 +262,7 @@ def write_surface(
     Raises
     ------
     InputError, GeometryError
-        Another suffix, points that are not finite, data that do not fit, or a file that cannot be
-        written.
+        Another suffix, points that are not finite, or a file that cannot be written.
     """
     target = Path(path)
     _check_suffix(target, (".vtp",))
@@ -283,13 +274,6 @@ def write_surface(
         {name: np.ascontiguousarray(v, np.int8 if v.dtype == bool else None) for name, v in given}
         for given in ((point_data or {}).items(), (cell_data or {}).items())
     ]
-    for arrays, rows in zip(data, (len(points), len(faces)), strict=True):
-        for name, values in arrays.items():
-            if len(values) != rows or values.dtype.kind not in "iuf":
-                raise InputError(
-                    f"{target}: data {name!r} of shape {values.shape} and type {values.dtype}, "
-                    f"expected {rows} rows of numbers"
-                )
     surface = polydata(points, faces.ravel(), np.full(len(faces), 3), *data)
     if space:
         words = vtk_module("vtkCommonCore").vtkStringArray()
@@ -312,7 +296,7 @@ def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray
     """Cell data with the labels, and an indicator per region that carries its name."""
     result: dict[str, NDArray[np.generic]] = {"region": region}
     for number, name in enumerate(names):
-        result[REGION_PREFIX + name] = (region == number).astype(np.int8)
+        result[f"region.{name}"] = (region == number).astype(np.int8)
     return result
 
 
@@ -323,22 +307,13 @@ def write_surface_series(
 
     The states ``NAME_0000.vtp``, ``NAME_0001.vtp``, ... lie next to their index ``NAME.pvd``.
 
-    Raises
-    ------
-    InputError
-        Times do not increase or do not fit the states; as `write_surface`.
+    Raises as `write_surface`.
     """
     index = Path(path)
     _check_suffix(index, (".pvd",))
-    moments = np.asarray(times, dtype=np.float64)
-    if len(states) != len(moments) or not len(states) or (np.diff(moments) <= 0).any():
-        raise InputError(
-            f"{index}: {len(states)} states and times {moments.tolist()}, expected as many, "
-            "increasing, at least one"
-        )
     root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ET.SubElement(root, "Collection")
-    for number, (time, state) in enumerate(zip(moments.tolist(), states, strict=True)):
+    for number, (time, state) in enumerate(zip(map(float, times), states, strict=True)):
         file = index.with_name(f"{index.stem}_{number:04d}.vtp")
         data = (state.point_data, state.cell_data)
         write_surface(file, state.vertices, state.triangles, *data, space="LPS")

@@ -87,27 +87,16 @@ WRITABLE = ("uint8", "int16", "float32")
 class LabelMap:
     """Labelled voxels. World coordinates are LPS, in mm.
 
-    Attributes
-    ----------
-    frames : (F, I, J, K) integers
-        Frames over time, or the layers of a segmentation.
-    is_layers : bool
-        Whether they are layers, which show one instant.
-    spacing : (3,) mm
-    direction : (3, 3)
-        Its columns are the unit vectors of i, j and k; orthonormal, perhaps left-handed.
-    origin : (3,) mm
-        Centre of voxel (0, 0, 0).
-    segments : tuple of Segment
-        Segments that a ``.seg.nrrd`` names; empty for other files.
+    The columns of ``direction`` are the unit vectors of i, j and k; orthonormal, perhaps
+    left-handed.
     """
 
-    frames: NDArray[np.integer]
-    is_layers: bool
-    spacing: FloatArray
-    direction: FloatArray
-    origin: FloatArray
-    segments: tuple[Segment, ...]
+    frames: NDArray[np.integer]  # (F, I, J, K), over time, or the layers of a segmentation
+    is_layers: bool  # whether they are layers, which show one instant
+    spacing: FloatArray  # (3,) mm
+    direction: FloatArray  # (3, 3)
+    origin: FloatArray  # (3,) mm, centre of voxel (0, 0, 0)
+    segments: tuple[Segment, ...]  # that a ``.seg.nrrd`` names; empty for other files
 
 
 def read_volume(
@@ -162,13 +151,7 @@ def read_labels(path: Path | str) -> LabelMap:
 
 
 def sequence_path(path: Path | str) -> Path:
-    """The path, which must end in ``.seq.nrrd``.
-
-    Raises
-    ------
-    InputError
-        Another name.
-    """
+    """The path; raises an InputError unless it ends in ``.seq.nrrd``."""
     target = Path(path)
     if not target.name.endswith(".seq.nrrd") or target.name == ".seq.nrrd":
         raise InputError(f"{target}: name {target.name!r}, expected one that ends in .seq.nrrd")
@@ -176,16 +159,10 @@ def sequence_path(path: Path | str) -> Path:
 
 
 def write_sequence_nrrd(path: Path | str, sequence: VolumeSequence) -> Path:
-    """Write a volume over time with its times and modality; the same content gives the same bytes.
+    """Write a volume of uint8, int16 or float32 over time to a file that ends in ``.seq.nrrd``.
 
-    The axis of frames comes first, which all versions of Slicer read.
-
-    Parameters
-    ----------
-    path
-        Ends in ``.seq.nrrd``.
-    sequence
-        Of uint8, int16 or float32.
+    The same content gives the same bytes. The axis of frames comes first, which all versions of
+    Slicer read.
 
     Raises
     ------

@@ -110,8 +110,7 @@ def test_the_program_predicts_what_the_library_predicts(tmp_path):
         len(TINY.points),
         units=("MPa", "MPa"),
         settings={"cells": [2, 2], "observed": [4, 3], "load_steps": 2},
-        differences=Differences("central", 1e-3),
-        reuse=False,
+        differences=Differences(1e-3),
     )
     answer = program(M)
     assert answer.converged, answer.reason

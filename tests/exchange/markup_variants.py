@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from itertools import product
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import slicerio
 
-from tests.exchange.variant import Variant
+from tests.exchange.variant import Variant, each_option
 
 LABELS = ("anterolateral", "posteromedial", "F-3")
 POSITIONS = np.array([[1.5, -2.0, 3.0], [4.0, 5.0, -6.25], [-7.5, 8.0, 90.0]])
@@ -20,7 +20,7 @@ SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/"
     "Schema/markups-schema-v{}.json#"
 )
-BESIDE = ("Line", "Angle", "Plane", "ROI", "an empty list", "a point that is not placed")
+BESIDE = ("Line", "ROI", "an empty list", "a point that is not placed")
 
 
 def points(system: str) -> list[dict[str, Any]]:
@@ -53,17 +53,11 @@ def markups(
 
 
 def fcsv(path: Path, version: str, system: str) -> None:
-    first, columns = "id", "x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
     lines = [f"# Markups fiducial file version = {version}", f"# CoordinateSystem = {system}"]
-    if version == "2":
-        first, columns = "label", "x,y,z,sel,vis"
-        lines = ["# Fiducial List file F.fcsv", "# version = 2", "# name = F"]
-    lines.append(f"# columns = {first},{columns}")
+    lines.append("# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID")
     for k, (label, position) in enumerate(zip(LABELS, POSITIONS, strict=True)):
-        x, y, z = position if system in ("LPS", "1") else position * [-1, -1, 1]
-        rest = "1,1" if version == "2" else f"0,0,0,1,1,1,0,{label},,"
-        node = label if version == "2" else f"vtkMRMLMarkupsFiducialNode_{k}"
-        lines.append(f"{node},{x},{y},{z},{rest}")
+        x, y, z = position if system == "LPS" else position * [-1, -1, 1]
+        lines.append(f"vtkMRMLMarkupsFiducialNode_{k},{x},{y},{z},0,0,0,1,1,1,0,{label},,")
     path.write_text("\n".join(lines) + "\n")
 
 
@@ -77,18 +71,13 @@ def converted(path: Path) -> None:
 
 def markup_variants() -> Iterator[Variant]:
     """Lists of the same three points."""
-    for options in product(("1.0.0", "1.0.2", "1.0.3"), ("LPS", "RAS", "no system")):
-        yield Variant("Markups", options, "a.mrk.json", lambda p, o=options: markups(p, *o))
+    for row in each_option(("1.0.0", "1.0.2", "1.0.3"), ("no system", "RAS", "LPS")):
+        yield Variant("Markups", row, "a.mrk.json", lambda p, o=row: markups(p, *o))
+    now = partial(markups, version="1.0.3", system="LPS")
     for kind in ("Curve", "ClosedCurve"):
-        yield Variant(
-            "Markups", (kind,), "a.mrk.json", lambda p, k=kind: markups(p, "1.0.3", "LPS", k)
-        )
+        yield Variant("Markups", (kind,), "a.mrk.json", partial(now, kind=kind))
     for what in BESIDE:
-        yield Variant(
-            "Markups", (f"beside: {what}",), "a.mrk.json",
-            lambda p, w=what: markups(p, "1.0.3", "LPS", beside=w),
-        )  # fmt: skip
+        yield Variant("Markups", (f"beside: {what}",), "a.mrk.json", partial(now, beside=what))
     yield Variant("Markups", ("slicerio",), "a.mrk.json", converted)
-    for options in (("2", "RAS"), *product(("4.0", "4.5", "4.10"), ("0", "1")),
-                    *product(("4.11", "5.0"), ("LPS", "RAS"))):  # fmt: skip
-        yield Variant("fcsv", options, "a.fcsv", lambda p, o=options: fcsv(p, *o))
+    for row in each_option(("4.11", "5.0"), ("RAS", "LPS")):
+        yield Variant("fcsv", row, "a.fcsv", lambda p, o=row: fcsv(p, *o))

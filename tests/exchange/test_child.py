@@ -97,10 +97,3 @@ def test_a_forked_process_has_a_child_of_its_own(tmp_path):
     assert os.waitpid(pid, 0)[1] == 0
     assert int((tmp_path / "answer").read_text()) != own
     assert in_child(process, HERE) == own
-
-
-def test_missing_files_and_folders_are_named(tmp_path):
-    for path, words in ((tmp_path / "a.vtk", "no such file"), (tmp_path, "a folder")):
-        with pytest.raises(InputError) as raised:
-            in_child(process, path)
-        assert str(raised.value) == f"{path}: {words}"

@@ -23,10 +23,11 @@ from vtkmodules.vtkIOPLY import vtkPLYReader
 from experiments import cli
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
+from mvest.exchange.abaqus.deck import Deck
 from mvest.exchange.markups import read_markups
 from mvest.exchange.surfaces import read_surface
 from mvest.exchange.volumes import read_labels, read_volume
-from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.imaging.volume import Modality
 from tests.places import field_input
 
 TIPS = "tips=[-16,-0.24,-25,16,-0.24,-25]"
@@ -63,10 +64,11 @@ def test_surfaces_are_as_vtk_reads_them(name: str) -> None:
         np.testing.assert_array_equal(np.ravel(found.cell_data["region"]), labels)
 
 
-def check_place(found: VolumeSequence, spacing, direction, origin) -> None:
-    np.testing.assert_allclose(found.spacing, spacing[:3], rtol=1e-6)
-    np.testing.assert_allclose(found.direction, direction, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(found.origin, origin[:3], rtol=0, atol=1e-6)
+def test_phases_with_names_have_the_stated_interval() -> None:
+    path = field_input("slicer_text_index.seq.nrrd")
+    found = read_volume(path, modality=Modality.ULTRASOUND, frame_interval_s=0.03)
+    np.testing.assert_array_equal(found.frames, nrrd.read(str(path))[0])
+    np.testing.assert_allclose(found.times, [0, 0.03, 0.06])
 
 
 @pytest.mark.parametrize("name", ["itk3d.nhdr", "itk4d.nrrd"])
@@ -79,18 +81,10 @@ def test_volumes_are_as_simpleitk_reads_them(name: str) -> None:
     values = SimpleITK.GetArrayFromImage(image).reshape(-1, *image.GetSize()[2::-1])
     np.testing.assert_array_equal(found.frames, values.transpose(0, 3, 2, 1))
     direction = np.reshape(image.GetDirection(), (size, size))[:3, :3]
-    check_place(found, step, direction, image.GetOrigin())
+    np.testing.assert_allclose(found.spacing, step[:3], rtol=1e-6)
+    np.testing.assert_allclose(found.direction, direction, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.origin, image.GetOrigin()[:3], rtol=0, atol=1e-6)
     np.testing.assert_allclose(found.times, step[-1] * np.arange(len(values)) * (size == 4))
-
-
-def test_phases_by_their_names_are_frames_at_the_interval_that_is_given() -> None:
-    path = field_input("slicer_text_index.seq.nrrd")
-    values, header = nrrd.read(str(path))
-    found = read_volume(path, modality=Modality.ULTRASOUND, frame_interval_s=0.03)
-    np.testing.assert_array_equal(found.frames, values)
-    np.testing.assert_allclose(found.times, [0, 0.03, 0.06])
-    steps = header["space directions"][1:].T
-    np.testing.assert_allclose(found.direction * found.spacing, steps, rtol=0, atol=1e-6)
 
 
 def test_a_recording_lies_where_slicerheart_puts_it() -> None:
@@ -101,6 +95,10 @@ def test_a_recording_lies_where_slicerheart_puts_it() -> None:
     for index in here_and_there:
         np.testing.assert_allclose(dicom.world(index), saved.world(index), rtol=0, atol=1e-6)
     np.testing.assert_array_equal(dicom.frames, saved.frames)
+
+
+def test_a_deck_has_a_heading_in_latin_1() -> None:
+    assert list(Deck(field_input("latin1.inp")).sets["ELSET"]) == ["ALL"]
 
 
 def positions(path: Path) -> dict[str, list[list[float]]]:
@@ -180,28 +178,14 @@ def check_leaflets(case: ValveCase, role: Role, voxels: dict[str, np.ndarray]) -
         assert min(away, key=away.__getitem__) == name, away
 
 
-def drawn(name: str, anterior: int, posterior: int, frames: tuple[int, int] = (0, 0)) -> dict:
-    read = by_nibabel if name.endswith(".gz") else by_pynrrd
-    values, matrix = read(field_input(name))
-    places = {}
-    for region, label, frame in (
-        ("anterior", anterior, frames[0]), ("posterior", posterior, frames[1])
-    ):  # fmt: skip
-        places[region] = np.argwhere(values[frame] == label) @ matrix[:3, :3].T + matrix[:3, 3]
-    return places
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "labels"),
-    [
-        ("overlapping_empty_layer.seg.nrrd", (1, 1, (0, 1))),
-        ("child_cropped.nii.gz", (1, 2)),
-    ],
-)
-def test_leaflets_are_those_that_were_drawn(name: str, labels: tuple, tmp_path: Path) -> None:
+def test_leaflets_are_those_that_were_drawn(tmp_path: Path) -> None:
+    name = "overlapping_empty_layer.seg.nrrd"
     case = imported("leaflets", name, tmp_path, TIPS)
-    check_leaflets(case, Role.REFERENCE, drawn(name, *labels))
+    values, matrix = by_pynrrd(field_input(name))
+    layers = {"anterior": values[0], "posterior": values[1]}
+    drawn = {k: np.argwhere(x == 1) @ matrix[:3, :3].T + matrix[:3, 3] for k, x in layers.items()}
+    check_leaflets(case, Role.REFERENCE, drawn)
 
 
 @pytest.mark.slow

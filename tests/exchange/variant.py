@@ -7,27 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Variant"]
-
 
 @dataclass(frozen=True)
 class Variant:
-    """One way of writing what a test knows.
+    """One way of writing the test's content; ``given`` is what the user states in addition.
 
-    Attributes
-    ----------
-    format : str
-        Its row in the table of the documentation.
-    options : tuple of str
-        What sets it apart from others of the format.
-    file : str
-        Name of the file; its suffix is the format's.
-    write : callable
-        Writes it to a path.
-    labels : bool
-        Whether the file says which leaflet is which.
-    given : dict
-        What a user states beside the file, as the format has no place for it.
+    ``labels`` says whether the file states which leaflet is which.
     """
 
     format: str
@@ -39,3 +24,8 @@ class Variant:
 
     def __str__(self) -> str:
         return f"{self.format}: {', '.join(self.options)}"
+
+
+def each_option(*columns: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Rows with every option of every column, as many as the longest column has."""
+    return [tuple(c[k % len(c)] for c in columns) for k in range(max(map(len, columns)))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 from scipy.spatial.transform import Rotation
 
-from tests.exchange.variant import Variant
+from tests.exchange.variant import Variant, each_option
 
 SHAPE = (3, 16, 17, 21)
 SPACING = np.array([1.5, 1.25, 1.0])
@@ -32,9 +32,9 @@ AFFINE = np.eye(4)
 AFFINE[:3, :3], AFFINE[:3, 3] = DIRECTION * SPACING, ORIGIN
 
 
-def frames(dtype: str = "uint8", shape: tuple[int, ...] = SHAPE) -> np.ndarray:
+def frames(dtype: str = "uint8") -> np.ndarray:
     """Voxels ``(T, I, J, K)``, different wherever axes are swapped."""
-    return np.random.default_rng(7).integers(0, 100, shape).astype(dtype)
+    return np.random.default_rng(7).integers(0, 100, SHAPE).astype(dtype)
 
 
 def label_map() -> np.ndarray:
@@ -44,7 +44,7 @@ def label_map() -> np.ndarray:
     return result
 
 
-def itk(values: np.ndarray, step: float = 0.04, direction=DIRECTION) -> SimpleITK.Image:
+def itk(values: np.ndarray, direction=DIRECTION) -> SimpleITK.Image:
     """An image of three or, with time as the last, of four axes."""
     image = SimpleITK.GetImageFromArray(
         np.ascontiguousarray(values.transpose(*range(values.ndim - 3), -1, -2, -3)), isVector=False
@@ -52,7 +52,7 @@ def itk(values: np.ndarray, step: float = 0.04, direction=DIRECTION) -> SimpleIT
     more, size = values.ndim - 3, values.ndim
     whole = np.eye(size)
     whole[:3, :3] = direction
-    image.SetSpacing([*SPACING, *[step] * more])
+    image.SetSpacing([*SPACING, *[0.04] * more])
     image.SetOrigin([*ORIGIN, *[0.0] * more])
     image.SetDirection(whole.ravel().tolist())
     return image
@@ -90,9 +90,6 @@ def directions(axis: int | None) -> np.ndarray:
     return rows if axis is None else np.insert(rows, axis, np.nan, axis=0)
 
 
-TEXT_INDEX = ("phases as text", "slicerio with phases as text")
-
-
 def header(axis: int | None, encoding: str = "gzip") -> dict[str, Any]:
     """As 3D Slicer writes it, with the frames along an axis or without frames."""
     result: dict[str, Any] = {
@@ -126,14 +123,6 @@ def more_nrrd(path: Path, what: str) -> None:
     elif what == "milliseconds":
         fields["units"] = ["ms", "", "", ""]
         fields["axis 0 index values"] = "0 40 80"
-    elif what == "multivolume":
-        for name in ("labels", "units", "axis 0 index type", "axis 0 index values"):
-            del fields[name]
-        fields["MultiVolume.FrameLabels"] = "0,40,80"
-        fields["MultiVolume.FrameIdentifyingDICOMTagUnits"] = "ms"
-    elif what == "phases as text":
-        del fields["units"]
-        fields |= {"axis 0 index type": "text", "axis 0 index values": "ED mid%20systole ES"}
     elif what.startswith("slicerio"):
         made = [{"voxels": frame, "ijkToLPS": AFFINE} for frame in values]
         times: dict[str, Any] = {"index_values": list(map(str, TIMES))}
@@ -147,7 +136,7 @@ def more_nrrd(path: Path, what: str) -> None:
 
 
 def segments(path: Path, what: str) -> None:
-    """A segmentation by slicerio, as Slicer has it since 4.11, or without its keys as before."""
+    """A segmentation by slicerio, as Slicer has written it since 4.11."""
     made = slicerio.create_segmentation(SHAPE[1:], AFFINE)
     for label, name in ((1, "mitral_anterior_leaflet"), (2, "mitral_posterior_leaflet")):
         mask = label_map() == label
@@ -158,19 +147,12 @@ def segments(path: Path, what: str) -> None:
         made["voxels"] = np.stack([made["voxels"], np.zeros_like(made["voxels"])])
         made["segments"].append({"id": "Segment_3", "name": "annulus", "labelValue": 1, "layer": 1})
     slicerio.write_segmentation(str(path), made)
-    if what == "before 4.11":
-        values, fields = nrrd.read(str(path))
-        kept = {k: v for k, v in fields.items() if not k.endswith(("LabelValue", "Layer"))}
-        both = np.stack([values == label for label in (1, 2)]).astype(np.uint8)
-        kept |= {"kinds": ["list", *["domain"] * 3], "space directions": directions(0)}
-        nrrd.write(str(path), both, kept)
 
 
 def map_of_labels(path: Path, what: str) -> None:
     """Labels 1 and 2 in a plain image, or among empty frames."""
     values = label_map()
-    if what in ("int16", "int64", "float32", "float64"):
-        values = values.astype(what)
+    values = values if what.startswith("4D") else values.astype(what)
     if what in ("4D in ms", "4D without a unit"):
         image = nibabel.Nifti1Image(np.stack([values * 0, values, values * 0], 3), RAS @ AFFINE)
         if what == "4D in ms":
@@ -187,11 +169,9 @@ PHILIPS = "1.2.840.113543.6.6.1.3.10002"
 """Class of Philips Cartesian DICOM: 3D echo over time in private fields, lengths in cm."""
 
 
-def dataset(shape: tuple[int, ...] = SHAPE, before: bytes = b"") -> Dataset:
+def dataset() -> Dataset:
     """As QLAB exports it; voxels of the class have no direction but their own axes."""
-    values = frames(shape=shape)
-    count, i, j, k = shape
-    data = Dataset()
+    data, (count, i, j, k) = Dataset(), SHAPE
     data.SOPClassUID, data.Modality, data.FrameTime = PHILIPS, "US", "40"
     data.PhysicalUnitsXDirection = data.PhysicalUnitsYDirection = 3
     data.PhysicalDeltaX, data.PhysicalDeltaY, _ = SPACING / 10
@@ -201,8 +181,7 @@ def dataset(shape: tuple[int, ...] = SHAPE, before: bytes = b"") -> Dataset:
     data.add_new((0x3001, 0x0010), "LO", "Philips3D")
     for element, kind, value in ((1, "UL", k), (2, "US", 3), (3, "FD", SPACING[2] / 10)):
         data.add_new((0x3001, 0x1000 + element), kind, value)
-    voxels = before + values.transpose(0, 3, 2, 1).tobytes()
-    data.add_new((0x7FE0, 0x0010), "OB", voxels + b"\0" * (len(voxels) % 2))
+    data.add_new((0x7FE0, 0x0010), "OB", frames().transpose(0, 3, 2, 1).tobytes())
     return data
 
 
@@ -225,52 +204,36 @@ def philips(
 
 def volume_variants() -> Iterator[Variant]:
     """Images, their times in s, in ms or without unit."""
-    for options in product(("NIfTI-1", "NIfTI-2"), ("uint8", "int16", "float32")):
-        for name in ("a.nii", "a.nii.gz"):
-            yield Variant("NIfTI", (*options, name[1:]), name, lambda p, o=options: nifti(p, *o))
+    kinds = ("uint8", "int16", "float32")
+    for row in each_option(("NIfTI-1", "NIfTI-1", "NIfTI-2"), kinds, (".nii.gz", ".nii")):
+        yield Variant("NIfTI", row, f"a{row[2]}", lambda p, o=row[:2]: nifti(p, *o))
     for what in ("sform only", "qform only", "scaled", "seconds", "3D"):
-        yield Variant(
-            "NIfTI", (what,), "a.nii.gz", lambda p, w=what: nifti(p, "NIfTI-1", "int16", w)
-        )
-    for name, *options in product(
-        ("a.mha", "a.mhd"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
-    ):
-        yield Variant(
-            "MetaImage", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
-            given={"time_unit": "s"} if "4D" in options else {},
-        )  # fmt: skip
-    for name, *options in product(
-        ("a.nrrd", "a.nhdr"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
-    ):
-        yield Variant(
-            "NRRD by ITK", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
-            given={"time_unit": "s"} if "4D" in options else {},
-        )  # fmt: skip
-    for name, *options in product(
-        ("a.seq.nrrd", "a.nhdr"), ("frames first", "frames last"), ("raw", "gzip", "bzip2", "text"),
-        ("uint8", "int16", "float32"),
-    ):  # fmt: skip
-        yield Variant(
-            "NRRD by pynrrd", (name[1:], *options), name, lambda p, o=options: by_pynrrd(p, *o)
-        )
-    for what in ("RAS", "milliseconds", "multivolume", "3D", "slicerio", *TEXT_INDEX):
-        yield Variant(
-            "NRRD", (what,), "a.seq.nrrd", lambda p, w=what: more_nrrd(p, w),
-            given={"frame_interval_s": 0.04} if what in TEXT_INDEX else {},
-        )  # fmt: skip
-    for options in product(("explicit", "implicit"), ("preamble", "bare")):
-        yield Variant(
-            "Philips Cartesian DICOM", options, "a.dcm", lambda p, o=options: philips(p, *o)
-        )
+        how = partial(nifti, version="NIfTI-1", dtype="int16", more=what)
+        yield Variant("NIfTI", (what,), "a.nii.gz", how)
+    packed = ("compressed", "plain", "plain", "compressed")
+    for form, ends in (("MetaImage", (".mha", ".mhd")), ("NRRD by ITK", (".nrrd", ".nhdr"))):
+        for row in each_option(ends, ("4D", "4D", "3D", "3D"), kinds, packed):
+            given = {"time_unit": "s"} if "4D" in row else {}
+            write = lambda p, o=row[1:]: by_itk(p, *o)  # noqa: E731
+            yield Variant(form, row, f"a{row[0]}", write, given=given)
+    axes, packed = ("frames last", "frames first"), ("gzip", "gzip", "raw", "bzip2", "text", "raw")
+    for row in each_option((".seq.nrrd", ".nhdr", ".nhdr"), axes, packed, kinds):
+        yield Variant("NRRD by pynrrd", row, f"a{row[0]}", lambda p, o=row[1:]: by_pynrrd(p, *o))
+    for what in ("RAS", "milliseconds", "3D", "slicerio", "slicerio with phases as text"):
+        given = {"frame_interval_s": 0.04} if "phases" in what else {}
+        yield Variant("NRRD", (what,), "a.seq.nrrd", partial(more_nrrd, what=what), given=given)
+    for row in each_option(("explicit", "implicit"), ("preamble", "bare")):
+        yield Variant("Philips Cartesian DICOM", row, "a.dcm", lambda p, o=row: philips(p, *o))
 
 
 def label_variants() -> Iterator[Variant]:
     """Label maps of one frame, or of one that is not empty."""
-    for what in ("one layer", "overlapping layers", "an empty layer", "before 4.11"):
-        yield Variant(
-            "Slicer segmentation", (what,), "a.seg.nrrd", lambda p, w=what: segments(p, w)
-        )
-    kinds = ("uint8", "int16", "int64", "float32", "float64")
-    for form, name in (("NRRD", "a.nrrd"), ("MetaImage", "a.mha"), ("NIfTI", "a.nii.gz")):
-        for what in (*kinds, *(("4D in ms", "4D without a unit") if form == "NIfTI" else ())):
-            yield Variant(f"{form} labels", (what,), name, lambda p, w=what: map_of_labels(p, w))
+    for what in ("one layer", "overlapping layers", "an empty layer"):
+        yield Variant("Slicer segmentation", (what,), "a.seg.nrrd", partial(segments, what=what))
+    for form, name, kinds in (
+        ("NRRD", "a.nrrd", ("int16", "int64", "float32")),
+        ("MetaImage", "a.mha", ("uint8", "float64")),
+        ("NIfTI", "a.nii.gz", ("uint8", "int64", "4D in ms", "4D without a unit")),
+    ):
+        for what in kinds:
+            yield Variant(f"{form} labels", (what,), name, partial(map_of_labels, what=what))

@@ -12,7 +12,7 @@ from tests.places import ROOT
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits are those of Linux")
 
 STORED = ROOT / "tests" / "fuzz" / "stored"
-INPUTS = 20
+INPUTS = 10
 """For each valid file, the same ones every time: what is new is found by `make fuzz`."""
 
 

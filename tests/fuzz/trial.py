@@ -15,7 +15,7 @@ from mvest.errors import MvestError
 from tests.fuzz.mutation import changed
 
 MAX_SECONDS, MAX_BYTES, MAX_LETTERS = 5, 2**30, 300
-"""Of computing in this process; of memory beside what it has; of a message, its folder aside."""
+"""CPU seconds, additional memory, and length of a message without its folder."""
 FAULTS = ("outside", "message", "memory", "slow")
 ENDS = ("read", "refused", "stopped", *FAULTS)
 
@@ -31,7 +31,7 @@ class Late(BaseException):
 
 
 class Bench:
-    """The valid files of an importer in a folder, each written over by what is made of it."""
+    """The valid files of an importer in a folder, which damaged ones replace."""
 
     def __init__(self, enter: Enter, makers: Makers, folder: Path) -> None:
         self.enter, self.paths = enter, list[Path]()
@@ -43,7 +43,7 @@ class Bench:
         """How the valid files are read, which also loads what the importer needs."""
 
     def damaged(self, seed: int) -> tuple[int, bytes]:
-        """The number of a valid file, and bytes made of it; both follow from a number."""
+        """The number of a valid file, and damaged bytes of it."""
         draw = random.Random(seed)
         number = draw.randrange(len(self.paths))
         return number, changed(self.contents[number], draw)

@@ -1,7 +1,6 @@
 """Numbers, words, JSON, YAML and tables of others."""
 
 import json
-import math
 import os
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 import yaml
 
 from mvest.errors import GeometryError, InputError
-from mvest.files import write_atomically
 from mvest.reading.documents import parse_json, read_mapping, read_yaml
 from mvest.reading.text import (
     MAX_LINE,
@@ -23,8 +21,7 @@ from mvest.reading.text import (
     refusing,
 )
 
-ODD = ("", ".", "1e", "1_0", "0x10", "1:30", "nan", "-Infinity", "1e309", "9" * 5000, "-2e9", "٣",
-       "1,5", "1 2", "1\n2", "1\0")  # fmt: skip
+ODD = ("", "1_0", "0x10", "nan", "1e309", "9" * 5000, "-2e9", "٣", "1,5", "1\n2")
 
 
 @pytest.mark.parametrize("text", ODD)
@@ -33,12 +30,6 @@ def test_what_is_no_decimal_number_within_sense_is_refused(text):
         number(text)
     assert len(str(caught.value)) < 100
     assert str(caught.value).isprintable()
-
-
-@pytest.mark.parametrize("text", ["-1", "+5", "1.", ".5", "1E+5", " 12 ", "1e-320"])
-def test_decimal_numbers(text):
-    assert number(text) == float(text)
-    assert number(repr(math.pi * 1e200), math.inf) == math.pi * 1e200
 
 
 @pytest.mark.parametrize("text", ["a\ud800", "\x1b[2J", "\uffff", "a" * 20_001])
@@ -66,14 +57,9 @@ def test_files_are_read_within_bounds(tmp_path):
         read_text(path)
     with pytest.raises(InputError, match="is missing"):
         read_text(tmp_path / "none")
-    with pytest.raises(InputError, match="a folder"):
-        read_text(tmp_path)
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="no regular file"):
         read_text(tmp_path / "pipe")
-
-
-# --- JSON ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -96,9 +82,6 @@ def test_json_that_is_read(tmp_path):
     (tmp_path / "a.json").write_text("[]")
     with pytest.raises(InputError, match="holds a list, expected a mapping"):
         read_mapping(tmp_path / "a.json")
-
-
-# --- YAML ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -142,19 +125,13 @@ def test_a_document_that_is_refused(tmp_path, text, words):
         read_yaml(tmp_path / "a.yaml")
 
 
-# --- tables -------------------------------------------------------------------------------------
-
-
-def test_a_cell_that_is_no_number_is_named(tmp_path):
-    (tmp_path / "a.csv").write_text("x,y\n1,2\n3,1_0\n")
-    with pytest.raises(InputError, match=r"a\.csv: y of row 1"):
-        read_numbers(tmp_path / "a.csv", ("x", "y"))
-
-
 def test_tables(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(' y , x \n\n 1,"2"\n3,4.5\n')
     assert read_numbers(path, ("x", "y")).tolist() == [[2, 1], [4.5, 3]]
+    path.write_text("x,y\n1,2\n3,1_0\n")
+    with pytest.raises(InputError, match=r"a\.csv: y of row 1"):
+        read_numbers(path, ("x", "y"))
     for text, words in (
         ("x,y,z\n1,2,3\n", "columns x,y,z, expected x,y"), ("x,y\n", "no rows"), ("", "none"),
         ("x,y\n1,2,3\n", "row 0 has 3 cells"), ('x,y\n"1,2\n', "no comma-separated text"),
@@ -165,16 +142,11 @@ def test_tables(tmp_path):
             read_columns(path, ("x", "y"))
 
 
-# --- whatever is raised -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("error", "kind", "words"),
     [
         (GeometryError("open"), GeometryError, "a.stl: open"),
         (RuntimeError("a\n\x1b[31m b"), InputError, "a.stl: damaged or no STL file: a �[31m b"),
-        (MemoryError(), InputError, "a.stl: damaged or no STL file: MemoryError"),
-        (GeometryError("x" * 1000), GeometryError, "a.stl: x"),
         (GeometryError("/nowhere/a.stl: open"), GeometryError, "a.stl: open"),
     ],
 )
@@ -186,14 +158,6 @@ def test_everything_becomes_one_line(error: Exception, kind: type, words: str) -
     assert message.startswith(f"/nowhere/{words}")
     assert message.count("nowhere") == 1
     assert len(message.removeprefix("/nowhere/")) <= MAX_LINE
-
-
-def test_an_interruption_is_let_through() -> None:
-    with pytest.raises(KeyboardInterrupt), refusing(Path("a.stl"), "STL file"):
-        raise KeyboardInterrupt
-
-
-# --- what is written ----------------------------------------------------------------------------
 
 
 def test_a_text_is_not_lost_for_one_character(tmp_path):

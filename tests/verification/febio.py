@@ -30,8 +30,7 @@ from mvest.exchange.exporting.febio import (
     FebioOptions,
     valve_document,
 )
-from mvest.exchange.febio.document import FebDocument
-from mvest.exchange.febio.mesh import LAWS, NAMES, febio_law, febio_mesh
+from mvest.exchange.febio.document import LAWS, NAMES, FebDocument, febio_law, febio_mesh
 from mvest.files import write_atomically
 from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.integrate import simulate

@@ -57,24 +57,6 @@ class _Block:
 class Deck:
     """The content of a deck; nodes and elements are numbered from 0 in its order.
 
-    Attributes
-    ----------
-    nodes : list of list
-        ``(n, 3)``.
-    cells : list of list
-        Nodes of each element: 4 of a shell (a triangle repeats the last), 2 of a truss.
-    sets : dict
-        NSET or ELSET -> name in capitals -> increasing numbers.
-    sections : list of tuple
-        Elements, material, and thickness (mm) of shells or cross section (mm^2) of trusses, 0 if
-        not given. Later sections of an element override earlier ones.
-    ogden : dict
-        Material -> ``(t, 2)`` mu (MPa) and alpha of each term.
-    pressures : list of tuple
-        Elements, pressure (MPa) against their normals, and its amplitude.
-    period : float
-        s, of the step.
-
     Raises
     ------
     InputError
@@ -82,13 +64,17 @@ class Deck:
     """
 
     def __init__(self, path: Path) -> None:
-        self.nodes: list[list[float]] = []
-        self.cells: list[list[int]] = []
+        self.nodes: list[list[float]] = []  # (n, 3)
+        self.cells: list[list[int]] = []  # nodes: 4 of a shell (S3 repeats the last), 2 of a truss
+        # NSET or ELSET -> name in capitals -> increasing numbers
         self.sets: dict[str, dict[str, IntArray]] = {"NSET": {}, "ELSET": {}}
+        # Elements, material, and thickness (mm) or cross section (mm^2), 0 if not given. Later
+        # sections of an element override earlier ones.
         self.sections: list[tuple[IntArray, str, float]] = []
-        self.ogden: dict[str, FloatArray] = {}
+        self.ogden: dict[str, FloatArray] = {}  # material -> (t, 2) mu (MPa) and alpha
+        # Elements, pressure (MPa) against their normals, and its amplitude
         self.pressures: list[tuple[IntArray, float, str]] = []
-        self.period = 0.0
+        self.period = 0.0  # s, of the step
         self._labels: dict[str, dict[int, int]] = {"NSET": {}, "ELSET": {}}
         self._surfaces: dict[str, list[tuple[IntArray, float]]] = defaultdict(list)
         self._amplitudes: dict[str, tuple[FloatArray, FloatArray]] = {}

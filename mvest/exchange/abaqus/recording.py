@@ -14,17 +14,17 @@ Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w),
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
 
-from mvest.errors import InputError
-from mvest.exchange.abaqus.chordae import TOE_STRAIN, trace_cables, truss_stiffness
+from mvest.errors import GeometryError, InputError
 from mvest.exchange.abaqus.deck import Deck
 from mvest.exchange.surfaces import read_mesh
 from mvest.reading.text import named, one_line, refusing
@@ -33,6 +33,12 @@ from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates
 from mvest.valve.mesh.remesh import remesh
 
+TOE_STRAIN = 0.01
+"""Strain of the secant stiffness of chordae.
+
+Chordae act as strings that hardly lengthen. The far higher stiffness of exponential ones at several
+percent would describe a state that no recorded closure reaches.
+"""
 TOLERANCE_MM = 1e-3
 """Frames have single precision: 2e-6 mm at 30 mm."""
 SAME_MM = 1e-6
@@ -48,19 +54,10 @@ PRESSURE_MPA = (1e-4, 0.1)
 class Recording:
     """A valve at rest and its recorded closure.
 
-    Attributes
-    ----------
-    valve : Valve
-        The fine midsurface in frame 0, normals to the ventricle, fibres parallel to the annulus,
-        and the motion of the frames.
-    frames : (f, n, 3) ndarray
-        mm, recorded positions of the vertices.
-    times : (f,) ndarray
-        s, from 0 to the end of the step.
-    pressure : float
-        MPa on the ventricular face at the end.
-    pressure_share : (f,) ndarray
-        Share of the pressure.
+    ``valve`` is the fine midsurface in frame 0, with normals to the ventricle, fibres parallel to
+    the annulus, and the motion of the frames. ``frames (f, n, 3)`` mm are the recorded positions of
+    its vertices at ``times (f,)`` s, from 0 to the end of the step. ``pressure`` is in MPa on the
+    ventricular face at the end, ``pressure_share (f,)`` its share in each frame.
     """
 
     valve: Valve
@@ -101,20 +98,11 @@ def recording_files(folder: Path) -> list[Path]:
 
 
 def read_recording(
-    folder: Path,
-    leaflets: Mapping[str, str],
-    annulus: str,
-    free_edge: str,
+    folder: Path, leaflets: Mapping[str, str], annulus: str, free_edge: str
 ) -> Recording:
-    """Read a recorded closure.
+    """Read a recorded closure: ``leaflets`` maps regions to element sets, the others are node sets.
 
-    Parameters
-    ----------
-    folder : Path
-    leaflets : mapping
-        Region -> element set, with or without its instance, in any case.
-    annulus, free_edge : str
-        Node sets.
+    Names may have their instance or not, in any case.
 
     Raises
     ------
@@ -164,7 +152,7 @@ def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArra
         raise InputError("no chordae: expected elements of type T3D2, each in a section")
     anchors = np.intersect1d(np.setdiff1d(edges, leaflets), deck.held)
     if not anchors.size:
-        raise InputError("no node of the chordae is held, so no papillary muscle is known")
+        raise InputError("no chord node is constrained, so the papillary muscles are unknown")
     anchor, insertion, length, share = trace_cables(nodes, edges, anchors, leaflets)
     # The family of a cable is the section of the first truss at its insertion.
     ends, first = np.unique(edges, return_index=True)
@@ -185,6 +173,105 @@ def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArra
         family_names=tuple(material.lower() for material in materials),
         toe_strain=TOE_STRAIN,
     )
+
+
+def trace_cables(
+    nodes: FloatArray, edges: IntArray, anchors: IntArray, leaflet: IntArray
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """The chord network of a detailed model as straight tension-only cables.
+
+    Detailed models hold chordae as a graph: a trunk leaves a papillary anchor, splits, and fans out
+    into many insertions. Each pair of anchor and insertion becomes a cable with
+
+    * the rest length of the shortest path along the network, so that it tightens exactly when the
+      path is straight;
+    * a share of the axial stiffness of the trunk. If all insertions of an anchor pull equally, the
+      force in edge ``e`` is ``n_e`` times that at an insertion, where ``n_e`` counts the paths
+      through ``e``. Insertion ``j`` then yields by ``sum_e n_e l_e / EA`` per unit force, as does a
+      cable of rest length ``L_j`` and stiffness ``EA L_j / sum_e n_e l_e``.
+
+    The cables do not restrain each other sideways, as branches of one trunk do.
+
+    Parameters
+    ----------
+    nodes : (n, 3) mm
+    edges : (k, 2)
+        Chord segments between nodes.
+    anchors, leaflet : (a,), (l,)
+        Nodes in the papillary muscles and of the leaflets. A path ends at the first leaflet node.
+
+    Returns
+    -------
+    anchor, insertion, length, share : (c,)
+        Nodes at the ends of each cable; mm along the network; axial stiffness of the cable over
+        that of the chord material, in (0, 1].
+
+    Raises
+    ------
+    InputError, GeometryError
+        A segment has no length or reaches no anchor, or an anchor reaches no leaflet.
+    """
+    length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
+    if np.any(length <= 0):
+        raise InputError(f"chord segment {int(np.argmin(length))} has no length")
+    on_leaflet = np.isin(np.arange(len(nodes)), leaflet)
+    # No edges out of leaflet nodes: two chords that insert at one node do not continue.
+    both = np.vstack([edges, edges[:, ::-1]])
+    outward = ~on_leaflet[both[:, 0]]
+    graph = csr_matrix(
+        (np.tile(length, 2)[outward], (both[outward, 0], both[outward, 1])),
+        shape=(len(nodes), len(nodes)),
+    )
+    distance, predecessor = dijkstra(graph, indices=anchors, return_predecessors=True)
+    reached = np.asarray(np.isfinite(distance).any(axis=0))
+    loose = np.flatnonzero(~reached[edges].all(axis=1))
+    if loose.size:
+        raise GeometryError(
+            f"{loose.size} chord segments are connected to no anchor (first: {loose[:5].tolist()})"
+        )
+    ends = np.unique(edges[on_leaflet[edges]])
+    reachable = np.isfinite(distance[:, ends])
+    if not reachable.any(axis=1).all():
+        alone = int(anchors[np.argmin(reachable.any(axis=1))])
+        raise GeometryError(f"chord anchor at node {alone} reaches no leaflet")
+    anchor_index, end_index = np.nonzero(reachable)
+    shares = []
+    for far, back, there in zip(distance, predecessor, reachable, strict=True):
+        own = ends[there].tolist()
+        paths = []  # without the anchor; a node stands for the segment that leads to it
+        for end in own:
+            path = [end]
+            while back[path[-1]] >= 0:
+                path.append(int(back[path[-1]]))
+            paths.append(path[:-1])
+        users = Counter(node for path in paths for node in path)
+        shares += [
+            far[end] / sum(users[node] * (far[node] - far[back[node]]) for node in path)
+            for end, path in zip(own, paths, strict=True)
+        ]
+    reach = distance[anchor_index, ends[end_index]]
+    return anchors[anchor_index], ends[end_index], reach, np.array(shares)
+
+
+def truss_stiffness(area: float, ogden: FloatArray, strain: float = TOE_STRAIN) -> float:
+    """Secant stiffness (N) of an incompressible Ogden truss of some area (mm^2): force over strain.
+
+    The nominal stress is ``sum 2 mu/alpha (l^(alpha-1) - l^(-alpha/2-1))`` at stretch
+    ``l = 1 + strain`` (Ogden 1972, Proc. R. Soc. A 326:565, in Abaqus' convention); ``ogden``
+    ``(t, 2)`` has mu (MPa) and alpha of each term. An InputError names an area or a stress that is
+    not positive.
+    """
+    mu, alpha = ogden.T
+    stretch = 1 + strain
+    with np.errstate(all="ignore"):
+        terms = stretch ** (alpha - 1) - stretch ** (-alpha / 2 - 1)
+        stress = sum(2 * mu / alpha * terms)
+    if not 0 < area * stress < float("inf"):
+        raise InputError(
+            f"{area:g} mm2 and {stress:g} MPa at a strain of {strain:g}, expected a cross section "
+            "and a stress > 0"
+        )
+    return float(area * (stress / strain))
 
 
 def _pressure(deck: Deck, leaflets: IntArray, times: FloatArray) -> tuple[float, FloatArray]:

@@ -12,14 +12,13 @@ from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, require_numbers
-from mvest.exchange.febio.document import FebDocument
-from mvest.exchange.febio.mesh import LAWS, febio_law, febio_mesh, opposite_faces
+from mvest.exchange.febio.document import LAWS, FebDocument, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading, build_system
 from mvest.typing import FloatArray
-from mvest.valve.mesh.given import GivenValve, tetrahedral_leaflets
+from mvest.valve.mesh.given import GivenValve
 
 GENERIC = {
     "E_f": {"anterior": 6.23, "posterior": 2.09},
@@ -40,26 +39,20 @@ EXPONENT = 4.0
 
 @dataclass(frozen=True, slots=True)
 class FebioOptions:
-    """What the case does not state, and choices in FEBio.
+    """Values that the case does not state, and choices in FEBio.
 
     Attributes
     ----------
     E_f, ratio : tuple of float, optional
         MPa and E_f over E_perp of each leaflet, in the order of the case's regions; generic by
         default.
-    nu, reading : float, str
-        Poisson ratio and its option (A or C).
     pressure_mmHg : float, optional
         By default that of the closed frame.
-    mesh : str
-        ``structured`` (bricks, of two leaflets) or ``tetwild`` (tetrahedra).
     columns, rows : int
         Bricks around the valve and along the leaflets.
-    edge_length : float
-        mm, of tetrahedra.
     law : str
         ``neo-hookean``, which is nearer to the linear law in compression and keeps elements from
-        inverting, or ``orthotropic`` (:mod:`mvest.exchange.febio.mesh`).
+        inverting, or ``orthotropic`` (:mod:`mvest.exchange.febio.document`).
     contact : str
         ``potential`` (FEBio's contact potential between the atrial faces) or ``none``.
     contact_gap_mm : float
@@ -76,13 +69,9 @@ class FebioOptions:
 
     E_f: tuple[float, ...] | None = None
     ratio: tuple[float, ...] | None = None
-    nu: float = 0.488
-    reading: str = "A"
     pressure_mmHg: float | None = None
-    mesh: str = "structured"
     columns: int = 24
     rows: int = 4
-    edge_length: float = 2.5
     law: str = "neo-hookean"
     contact: str = "potential"
     contact_gap_mm: float = 1.0
@@ -91,8 +80,7 @@ class FebioOptions:
     density_factor: float = 1000.0
 
     def __post_init__(self) -> None:
-        choices = {"mesh": ("structured", "tetwild"), "law": LAWS, "contact": CONTACTS}
-        for name, known in choices.items():
+        for name, known in {"law": LAWS, "contact": CONTACTS}.items():
             if (given := getattr(self, name)) not in known:
                 raise InputError(f"{name} {given!r}, expected one of {', '.join(known)}")
         if not 0 < self.contact_gap_mm < self.contact_reach_mm:
@@ -135,8 +123,7 @@ def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
             )
         chosen[what] = list(map(float, values))
     settings = {
-        name: TissueSettings(ratio, options.nu, options.reading)
-        for name, ratio in zip(names, chosen["ratio"], strict=True)
+        name: TissueSettings(ratio) for name, ratio in zip(names, chosen["ratio"], strict=True)
     }
     pressure = options.pressure_mmHg
     if pressure is None:
@@ -144,10 +131,7 @@ def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
             raise InputError(f"case {case.name}: no closed frame; give pressure_mmHg=...")
         pressure = case.closed.pressure_mmHg
     valve = GivenValve(case.valve)
-    if options.mesh == "structured":
-        mesh = valve.layers("hex18", options.columns, options.rows)
-    else:
-        mesh = tetrahedral_leaflets(case.surface, options.edge_length)
+    mesh = valve.layers("hex18", options.columns, options.rows)
     contact = valve.valve(CONTACT_COLUMNS, CONTACT_ROWS)
     mechanics = MechanicsSettings(settings, ClosureProtocol(pressure_mmHg=pressure))
     fixed = {f"E_f.{name}": value for name, value in zip(names, chosen["E_f"], strict=True)}

@@ -1,1 +1,1 @@
-"""A biomechanical model that is an external program (contract: README.md beside this file)."""
+"""A biomechanical model that is an external program (contract: README.md in this folder)."""

@@ -39,7 +39,6 @@ from mvest.typing import FloatArray
 
 REQUEST, POINTS = "request.json", "points.csv"
 RESPONSE, OBSERVATION, JACOBIAN = "response.json", "observation.csv", "jacobian.csv"
-ANSWERS = (RESPONSE, OBSERVATION, JACOBIAN)
 OUTPUT, ERRORS = "stdout.txt", "stderr.txt"
 COORDINATES = ("x", "y", "z")
 MAX_JSON_SIZE = 1_000_000
@@ -112,11 +111,6 @@ class Command:
         if shutil.which(program) is None:
             raise ConfigurationError(f"program {program!r} is not found or not executable")
 
-    def run(self, folder: Path) -> str:
-        """Run the program in ``folder``; return why it failed, or an empty text."""
-        with self.started(folder) as ended:
-            return ended()
-
     @contextlib.contextmanager
     def started(self, folder: Path) -> Iterator[Callable[[], str]]:
         """Start the program in ``folder``; yield a function that waits for its end.
@@ -182,24 +176,13 @@ class _Message(BaseModel):
 
 
 class RunRequest(_Message):
-    """The request of one run, as ``request.json`` holds it.
+    """The request of one run, as ``request.json`` holds it."""
 
-    Attributes
-    ----------
-    parameters : tuple of RequestParameter, (p,)
-    points : int
-        Number of observed points.
-    jacobian : bool
-        Whether derivatives are of use.
-    settings : mapping
-        Whatever else the program needs; plain data.
-    """
-
-    parameters: tuple[RequestParameter, ...] = Field(min_length=1)
-    points: int = Field(ge=1)
+    parameters: tuple[RequestParameter, ...] = Field(min_length=1)  # (p,)
+    points: int = Field(ge=1)  # number of observed points
     length_unit: Literal["mm"] = "mm"
-    jacobian: bool = True
-    settings: dict[str, Any] = {}
+    jacobian: bool = True  # whether derivatives are useful
+    settings: dict[str, Any] = {}  # plain data for the program
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -231,13 +214,7 @@ def write_request(folder: Path, request: RunRequest, points: FloatArray | None =
 
 
 def read_request(file: Path) -> RunRequest:
-    """Read ``request.json`` (for the program).
-
-    Raises
-    ------
-    InputError
-        The file is no request of this format.
-    """
+    """Read ``request.json`` (for the program); raises an InputError if it is no request."""
     return validated(RunRequest, read_mapping(file, MAX_JSON_SIZE), str(file))
 
 
@@ -290,13 +267,7 @@ def read_points(file: Path, count: int | None = None) -> FloatArray:
 
 
 def write_points(file: Path, points: FloatArray) -> None:
-    """Write positions ``(n, 3)`` mm as a table ``x,y,z``.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written.
-    """
+    """Write positions ``(n, 3)`` mm as a table ``x,y,z``; raises as `write_request`."""
     write_columns(file, COORDINATES, points.tolist())
 
 

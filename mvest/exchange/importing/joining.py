@@ -30,6 +30,10 @@ from mvest.valve.geometry.triangles import areas, surface_edges
 
 COINCIDENT = 1e-6
 """Merge distance (mm) of the vertices of both leaflets."""
+EDGE_MM = 1.0
+"""Mean edge length of the triangles of a band."""
+SEAM_MM = 1.5
+"""Largest distance over which boundaries are joined at a commissure."""
 MAX_HOLE = 0.2
 """Largest length of a hole's boundary over that of the leaflet; such holes are closed."""
 MAX_GAP = 6.0
@@ -154,8 +158,6 @@ def joined(
     contour: FloatArray | None,
     down: FloatArray,
     *,
-    seam_mm: float,
-    edge_mm: float,
     offset_mm: tuple[float, float],
     seams: FloatArray | None = None,
 ) -> tuple[Surface, FloatArray, float]:
@@ -165,16 +167,10 @@ def joined(
     ----------
     leaflets
         Anterior, posterior.
-    commissures
-        ``(2, 3)`` mm.
-    contour
-        ``(k, 3)`` mm, closed curve along the annulus, or None.
+    commissures, contour
+        ``(2, 3)`` mm; ``(k, 3)`` mm, closed curve along the annulus, or None.
     down
         ``(3,)`` from the annulus to the ventricle.
-    seam_mm
-        Largest distance of boundaries that are joined.
-    edge_mm
-        Mean edge length of the triangles.
     offset_mm
         Shifts of the anterior and the posterior leaflet towards the ventricle: half a thickness
         turns an atrial surface into the midsurface.
@@ -182,13 +178,8 @@ def joined(
         Joined share of each leaflet's free edge (columns) at each commissure (rows). A closed
         valve, whose edges touch all along, needs that of an open frame.
 
-    Returns
-    -------
-    surface : Surface
-        Regions 0 (anterior) and 1 (posterior).
-    seams : (2, 2)
-    gap : float
-        mm, largest width of the strips of triangles.
+    Returns the surface with the regions 0 (anterior) and 1 (posterior), the seams, and the largest
+    width (mm) of the strips of triangles.
 
     Raises
     ------
@@ -203,9 +194,8 @@ def joined(
                 f"the {name} leaflet ends {away:.1f} mm from a commissure, expected at most "
                 f"{MAX_GAP:g} mm: do leaflets and annulus have the same axes and phase?"
             )
-    place = (commissures, contour, down, seam_mm)
-    front, *arcs = _facing_ventricle(leaflets[0], leaflets[1], *place)
-    back, *others = _facing_ventricle(leaflets[1], leaflets[0], *place)
+    front, *arcs = _facing_ventricle(leaflets[0], leaflets[1], commissures, contour, down)
+    back, *others = _facing_ventricle(leaflets[1], leaflets[0], commissures, contour, down)
     ends, begins = front.vertices[arcs[0][[-1, 0]]], back.vertices[others[0][[0, -1]]]
     gap = np.linalg.norm(ends - begins, axis=1)
     if gap.sum() > np.linalg.norm(ends - begins[::-1], axis=1).sum():
@@ -224,7 +214,7 @@ def joined(
     for k in range(2):
         a, b = edges[k], edges[1 - k][::-1]
         given = None if seams is None else (seams[k, k], seams[k, 1 - k])
-        i, j = _seam(vertices[a], vertices[b], seam_mm, given)
+        i, j = _seam(vertices[a], vertices[b], given)
         shares[k, k], shares[k, 1 - k] = _shares(vertices[a])[i], _shares(vertices[b])[j]
         a, b = a[: i + 1], b[: j + 1]
         strip, sides, width = _strip(vertices, a, b)
@@ -242,8 +232,8 @@ def joined(
     band = LeafletBand.of(vertices[used], triangles, labels[proper], loops[0], loops[1], 0)
     around = 0.5 * sum(loop_length(vertices[used][loop]) for loop in loops)
     along = areas(vertices[used], triangles).sum() / around
-    columns = 4 * max(6, round(around / edge_mm / 4))
-    grid = band_grid(columns, 1 + max(4, round(along / edge_mm)))
+    columns = 4 * max(6, round(around / EDGE_MM / 4))
+    grid = band_grid(columns, 1 + max(4, round(along / EDGE_MM)))
     return _drawn(band, grid, columns, offset_mm), shares, max(gaps)
 
 
@@ -253,7 +243,6 @@ def _facing_ventricle(
     commissures: FloatArray,
     contour: FloatArray | None,
     down: FloatArray,
-    seam_mm: float,
 ) -> tuple[Leaflet, IntArray, IntArray]:
     """The leaflet with its triangles facing the ventricle, its arcs of annulus and free edge."""
     turned = replace(leaflet, triangles=leaflet.triangles[:, ::-1], loop=leaflet.loop[::-1])
@@ -265,13 +254,11 @@ def _facing_ventricle(
         annulus = arcs[int(np.argmax(away) if contour is None else np.argmin(away))]
         ring = np.vstack([candidate.vertices[annulus], other.curve.mean(0)])
         if loop_vector_area(ring) @ down > 0:
-            return candidate, *_cornered(candidate, annulus, other, seam_mm)
+            return candidate, *_cornered(candidate, annulus, other)
     raise GeometryError("a leaflet lies in the axis of the annulus, to neither side of the other")
 
 
-def _cornered(
-    leaflet: Leaflet, rough: IntArray, other: Leaflet, seam_mm: float
-) -> tuple[IntArray, IntArray]:
+def _cornered(leaflet: Leaflet, rough: IntArray, other: Leaflet) -> tuple[IntArray, IntArray]:
     """Arcs of annulus and free edge, split at the corners of the leaflet.
 
     Commissures are marked with errors of some mm. Along the annulus the other leaflet comes nearer
@@ -289,7 +276,7 @@ def _cornered(
         along = _along(leaflet.vertices[way])
         off = np.linalg.norm(closest_on_loop(leaflet.vertices[way], other.curve)[2], axis=1)
         distance = np.where(np.abs(along - expected) <= reach, off, np.inf)
-        first = int(np.argmax(distance <= max(seam_mm, float(distance.min()))))
+        first = int(np.argmax(distance <= max(SEAM_MM, float(distance.min()))))
         window = (along >= along[first]) & (along <= along[first] + CORNER)
         settled = distance <= distance[window].min() + SETTLED
         ends.append(way[first + int(np.argmax(settled[first:]))])
@@ -308,14 +295,12 @@ def _shares(curve: FloatArray) -> FloatArray:
     return _along(curve) / _along(curve)[-1]
 
 
-def _seam(
-    a: FloatArray, b: FloatArray, max_mm: float, given: tuple[float, float] | None
-) -> tuple[int, int]:
+def _seam(a: FloatArray, b: FloatArray, given: tuple[float, float] | None) -> tuple[int, int]:
     """Last joined points, 1 or more, of two curves that begin side by side."""
     shares = _shares(a), _shares(b)
     if given is None:
         distance, nearest = _nearest(a, b)
-        apart = min(max_mm, float(distance[0]) + OPENING)
+        apart = min(SEAM_MM, float(distance[0]) + OPENING)
         beside = (distance <= apart) & (shares[0] <= MAX_SEAM) & (shares[1][nearest] <= MAX_SEAM)
         last = len(a) if beside.all() else int(np.argmin(beside))
         i = max(1, last - 1)

@@ -39,22 +39,12 @@ Grid: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tissue:
-    """The leaflets of one frame: both together, or the anterior and the posterior one.
+    """The leaflets of one frame: both together, or the anterior and the posterior one."""
 
-    Attributes
-    ----------
-    masks : (I, J, K) each
-    grid : Grid
-    surface : ((n, 3) mm, (m, 3)) or None
-        One closed surface of both leaflets, in place of masks.
-    nameless : tuple of str
-        Two labels whose names do not say which leaflet they are.
-    """
-
-    masks: tuple[BoolArray, ...]
+    masks: tuple[BoolArray, ...]  # (I, J, K) each
     grid: Grid
-    surface: tuple[FloatArray, IntArray] | None = None
-    nameless: tuple[str, ...] = ()
+    surface: tuple[FloatArray, IntArray] | None = None  # of both leaflets, in place of masks
+    nameless: tuple[str, ...] = ()  # two labels whose names do not say which leaflet they are
 
     @property
     def points(self) -> FloatArray:
@@ -81,20 +71,12 @@ def tissue_of(
 ) -> Tissue:
     """The leaflets of a frame; all but a single closed surface become voxels.
 
-    Parameters
-    ----------
-    contents
-        Of one file, or of the files of the anterior and of the posterior leaflet.
-    frame
-        Frame of a label map over time (None: the first with labels), or the only layer of a
-        segmentation to use (None: all).
-    given
-        Names or numbers of the parts of one file that are the ``anterior`` and the ``posterior``
-        leaflet, or both (``leaflets``). By default terminology and names decide.
-    scale
-        mm per unit of surfaces.
-    derived
-        Sentences about used and unused parts are appended.
+    ``contents`` are those of one file, or of the files of the anterior and of the posterior
+    leaflet. ``frame`` is that of a label map over time (None: the first with labels), or the only
+    layer of a segmentation to use (None: all). ``given`` has names or numbers of the parts that are
+    the ``anterior`` and the ``posterior`` leaflet, or both (``leaflets``); by default terminology
+    and names decide. ``scale`` is mm per unit of surfaces. Sentences about used and unused parts
+    are appended to ``derived``.
 
     Raises
     ------

@@ -43,7 +43,7 @@ CLOSED_AT = 0.35
 
 @dataclass(frozen=True, slots=True)
 class LeafletsOptions:
-    """What a label map or surfaces do not state.
+    """Values that a label map or surfaces do not state.
 
     Attributes
     ----------
@@ -62,19 +62,15 @@ class LeafletsOptions:
         Papillary tips, antero-lateral and postero-medial: six numbers, LPS.
     muscles : list of two names or files
         Papillary muscles in the same order; their shapes give the tips.
-    commissures, anterior_point : tuple of float or None
-        Six numbers, and a point of the anterior annulus, for leaflets that are one label or
-        surface. By default the commissures are where the leaflets are shortest, and the anterior
-        leaflet is the taller one.
+    anterior_point : tuple of float or None
+        A point of the anterior annulus, for leaflets that are one label or surface. By default the
+        anterior leaflet is the taller one. The commissures are where the leaflets are shortest.
     pressure_mmHg : float or None
         Transmitral pressure on the closed valve.
     thickness_mm : tuple of float or None
         Thickness of the anterior and the posterior leaflet, instead of that between the walls.
     thickness_range_mm : tuple of float or None
         Smallest and largest thickness; others are clipped.
-    seam_mm : tuple of float or None
-        Lengths from the annulus down the two commissures over which the leaflets are one piece, if
-        the open frame does not show them.
     edge_mm : float
         Edge length of the triangles of the case.
     smoothing_mm : float
@@ -94,22 +90,20 @@ class LeafletsOptions:
     tips: tuple[float, ...] | None = None
     tips_closed: tuple[float, ...] | None = None
     muscles: tuple[str, ...] | None = None
-    commissures: tuple[float, ...] | None = None
     anterior_point: tuple[float, ...] | None = None
     pressure_mmHg: float | None = None
     thickness_mm: tuple[float, ...] | None = None
     thickness_range_mm: tuple[float, ...] | None = None
-    seam_mm: tuple[float, ...] | None = None
     edge_mm: float = 1.2
     smoothing_mm: float = 0.0
     observer_mm: float = OBSERVER_MM
     mirrored: bool = False
 
     def __post_init__(self) -> None:
-        counts = dict.fromkeys(("tips", "tips_closed", "commissures"), 6) | {"anterior_point": 3}
-        pairs = ("muscles", "thickness_mm", "thickness_range_mm", "seam_mm")
+        counts = {"tips": 6, "tips_closed": 6, "anterior_point": 3}
+        pairs = dict.fromkeys(("muscles", "thickness_mm", "thickness_range_mm"), 2)
         limits = {"edge_mm": (0.3, 5), "smoothing_mm": (0, 10), "observer_mm": (0, 5)}
-        check_options(self, counts | dict.fromkeys(pairs, 2), limits)
+        check_options(self, counts | pairs, limits)
 
     def words(self, name: str) -> tuple[str, ...]:
         """Names, numbers or files of an option that is one or a list of them."""
@@ -150,13 +144,10 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     with named(source):
         seen = _frames(source, options, derived)
         scale = _scale(seen[0].contents[0], options)
-    anterior, commissures = (
-        None if at is None else scale * np.squeeze(np.reshape(at, (-1, 3)))
-        for at in (options.anterior_point, options.commissures)
-    )
-    known: dict[str, Any] = {"commissures": commissures, "edge_mm": options.edge_mm}
+    anterior = options.anterior_point and scale * np.array(options.anterior_point)
+    known: dict[str, Any] = {"edge_mm": options.edge_mm}
     given = {name: options.words(name) for name in ("leaflets", *REGIONS)}
-    seams: Any = options.seam_mm
+    seams: Any = None
     exchanged, voxel = False, 0.0
     for one in seen:
         with named(*one.files):
@@ -314,7 +305,7 @@ def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) ->
         low, high = options.thickness_range_mm
         thin, thick = (100 * np.mean(outside) for outside in (thickness < low, thickness > high))
         derived.append(
-            f"thickness: kept between {low:g} mm ({thin:.0f} % of the vertices are thinner) and "
+            f"thickness: clipped to {low:g} mm ({thin:.0f} % of the vertices are thinner) and "
             f"{high:g} mm ({thick:.0f} % are thicker, up to {thickness.max():.1f} mm)"
         )
         thickness = np.clip(thickness, low, high)

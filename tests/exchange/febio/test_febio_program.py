@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import ConfigurationError
-from mvest.exchange.febio.document import FebDocument
-from mvest.exchange.febio.mesh import febio_law, febio_mesh
+from mvest.exchange.febio.document import FebDocument, febio_law, febio_mesh
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.law import Law
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
@@ -91,9 +90,3 @@ def test_positions_are_read_and_a_broken_step_left_out(tmp_path):
     times, frames = read_positions(tmp_path / "log.csv", 2)
     np.testing.assert_array_equal(times, [0.0, 0.1])
     np.testing.assert_array_equal(frames[1], [[0, 0, 1.5], [1, 0, 1.25]])
-
-
-def test_without_the_program_it_is_said_how_to_name_it(monkeypatch, tmp_path):
-    monkeypatch.setenv("MVEST_FEBIO", str(tmp_path / "none"))
-    with pytest.raises(ConfigurationError, match="MVEST_FEBIO"):
-        febio_program()

@@ -59,7 +59,6 @@ def test_one_surface_for_each_leaflet(tmp_path: Path) -> None:
     [
         ({"units": "um"}, "give units=mm, cm or m"),
         ({"units": "m"}, r"mm across, .* is units= right"),
-        ({"thickness_mm": (9.0, 9.0)}, "thickness of 9.0 mm, expected at most 5 mm"),
     ],
 )
 def test_missing_or_wrong_options_are_named(

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.abaqus.chordae import trace_cables, truss_stiffness
-from mvest.exchange.abaqus.deck import Deck
-from mvest.exchange.abaqus.recording import Recording, read_recording
+from mvest.exchange.abaqus.recording import Recording, read_recording, trace_cables, truss_stiffness
 from tests.exchange.surfaces.recorded import CASE, DOWN, NAMES, OGDEN, ROUND, skirt, write
 from tests.places import ROOT
 
@@ -41,27 +39,11 @@ def test_reader(recording):
     assert outward.sum(axis=1).max() < 0
     assert np.all(surface.thickness == 0.65)
     assert np.abs(surface.fibre[:, 2]).max() < 1e-6
+    # Trunk 5; branches from 5 mm inside and 15 - 9 = 6 mm below: sqrt(5^2 + 6^2) for the first.
+    assert len(valve.chordae) == 6
+    assert valve.chordae.rest_length.min() == pytest.approx(5 + np.sqrt(61), abs=1e-6)
     step = np.diff(np.unwrap(np.arctan2(*surface.vertices[valve.annulus, 1::-1].T)))
     assert np.abs(step) == pytest.approx(2 * np.pi / ROUND)
-
-
-def test_chordae_of_the_made_up_valve(recording):
-    chordae = recording.valve.chordae
-    assert len(chordae) == 6
-    # Trunk 5; branches from 5 mm inside and 15 - 9 = 6 mm below: sqrt(5^2 + 6^2) for the first.
-    assert np.sort(chordae.rest_length)[0] == pytest.approx(5 + np.sqrt(61), abs=1e-6)
-    straight = np.linalg.norm(
-        chordae.insertion - recording.valve.papillary_tips[chordae.tip], axis=1
-    )
-    assert np.all(chordae.rest_length >= straight)
-
-
-def test_the_coarse_valve_moves_with_its_vertices(recording):
-    kept, coarse = recording.remeshed(90)
-    for frame in range(4):
-        seen = recording.frames[frame][kept]
-        assert coarse.motion.annulus[frame] == pytest.approx(seen[coarse.annulus], abs=1e-5)
-    assert recording.frames[0][kept] == pytest.approx(coarse.surface.vertices, abs=1e-5)
 
 
 def test_tips_that_move_before_the_pressure(tmp_path):
@@ -96,7 +78,7 @@ def test_an_ear_quad_is_cut_from_its_corner(tmp_path):
     assert len(found.free_edge) == ROUND + 2
 
 
-def test_triangles_beside_quads(tmp_path, recording):
+def test_triangles_among_quads(tmp_path, recording):
     path = write(tmp_path, skirt())
     text = path.read_text()
     first = re.search(r"ELSET=septal_Quads\n(\d+),(\d+),(\d+),(\d+),(\d+)\n", text)
@@ -107,7 +89,6 @@ def test_triangles_beside_quads(tmp_path, recording):
     )
     path.write_text(text.replace(first.group(), split))
     found, whole = read(tmp_path).valve.surface, recording.valve.surface
-    assert len(found.triangles) == len(whole.triangles)
     assert found.areas.sum() == pytest.approx(whole.areas.sum())
     assert np.bincount(found.region).tolist() == [192, 192, 192]
 
@@ -127,24 +108,6 @@ def test_stiffness_of_the_chordae():
     assert [stiffness(name, 0.01) for name in OGDEN] == pytest.approx([88.1, 27.0, 8.04], rel=5e-3)
 
 
-LAW = re.compile(r"\*Hyperelastic, OGDEN, N=3\n.*\n0\.,")
-
-
-@pytest.mark.parametrize(
-    ("law", "message"),
-    [
-        ("*Hyperelastic, NEO HOOKE\n1, 2", "trusses of ANTERIOR_CHORDAE: expected .*OGDEN"),
-        ("*Hyperelastic, OGDEN, N=3\n1, 2", "N = 3, expected so many pairs"),
-        ("*Hyperelastic, OGDEN\n-1, 2, 0", "-.* MPa at a strain of 0.01"),
-    ],
-)
-def test_materials_that_are_no_chordae(tmp_path, law, message):
-    path = write(tmp_path, skirt())
-    path.write_text(LAW.sub(law, path.read_text()))
-    with pytest.raises(InputError, match=message):
-        read(tmp_path)
-
-
 def test_path_lengths_and_shares_of_a_fork():
     # Trunk of 2, branches of 1 and 3; both insertions pull equally, so the trunk carries two
     # forces: shares (2 + 1) / (2 * 2 + 1) and (2 + 3) / (2 * 2 + 3).
@@ -156,19 +119,9 @@ def test_path_lengths_and_shares_of_a_fork():
     assert share == pytest.approx([3 / 5, 5 / 7])
 
 
-def test_paths_end_at_the_leaflet():
-    # Two anchors meet in one leaflet node: neither path goes on to the other's anchor or node.
-    nodes = np.array([[0.0, 0, 0], [1, 0, 1], [2, 0, 0], [3, 0, 1]])
-    edges = np.array([[0, 1], [2, 1], [2, 3]])
-    anchor, insertion, _, _ = trace_cables(nodes, edges, np.array([0, 2]), np.array([1, 3]))
-    pairs = list(zip(anchor.tolist(), insertion.tolist(), strict=True))
-    assert pairs == [(0, 1), (2, 1), (2, 3)]
-
-
 @pytest.mark.parametrize(
     ("edges", "anchors", "error", "message"),
     [
-        ([[0, 1]], [0, 2], GeometryError, "anchor at node 2 reaches no leaflet"),
         ([[0, 1], [2, 3]], [0], GeometryError, "1 chord segments are connected to no anchor"),
         ([[0, 0]], [0], InputError, "chord segment 0 has no length"),
     ],
@@ -185,10 +138,8 @@ def test_bad_networks(edges, anchors, error, message):
         ({"rim": lambda x: x[:-1]}, "expected the two boundary loops"),
         ({"frames": lambda x: x[:1]}, "1 frames Skirt_NUMBER.vtu, expected 2 to 500"),
         ({"frames": lambda x: x + 1}, "Skirt_0.vtu: points are not the nodes of the deck"),
-        ({"frames": lambda x: x[:, :-1]}, r"Skirt_0.vtu: \d+ points, the deck has \d+ nodes"),
         ({"pressure": lambda x: 1e3 * x}, "pressure -1.33.*: stresses must be MPa"),
         ({"nodes": lambda x: 0.001 * x}, "the leaflets span 0.02.*: lengths must be mm"),
-        ({"edges": lambda x: x[:0]}, "no chordae: expected elements of type T3D2"),
     ],
 )
 def test_contradictions(tmp_path, change, message):
@@ -203,20 +154,13 @@ def test_contradictions(tmp_path, change, message):
     [
         ("type=T3D2", "type=B31", r"line \d+, \*ELEMENT: type B31, expected S4R, S3, T3D2"),
         ("*Nset, nset=Rim\n1,", "*Ngen, nset=Rim\n1,", r"\*NGEN: is not read"),
-        ("*Nset, nset=Rim\n1,", "*Nset, nset=Rim\n999,", "999 does not exist"),
         ("*Nset, nset=Rim", "*Nset, nset=Rand", "no node set 'Rim'; there are ALL"),
-        (".65, 5", "-.65, 5", "thickness or cross section -0.65, expected > 0"),
         (".65, 5\n", "", "shells without a section that states a thickness"),
         ("Valve.Both, SPOS", "Valve.Both, SNEG", "expected one pressure on all leaflets"),
-        ("Outside, P, ", "Outside, HP, ", "expected pressure P"),
         ("definition=SMOOTH STEP\n0., 0., 1.", "definition=PERIODIC\n0., 0., 1.",
          "PERIODIC, expected SMOOTH STEP"),
-        (", amplitude=Whole\nOutside", "\nOutside", "no amplitude ''; there are WHOLE, EARLY"),
         ("*End Step\n", "*End Step\n*Dynamic\n, 1.\n", "a second step, expected one"),
-        ("2, 9.", "2, nan, 9.", "damaged numbers|numbers in a line|not finite"),
-        ("** made up", "made up", "line 1: 'made up', expected a keyword first"),
-        ("*Instance, name=Valve, part=Leaflet", "*Instance, name=Valve, part=Leaflet\n0, 0",
-         "expected one instance, where its part is"),
+        ("*Hyperelastic, OGDEN", "*Hyperelastic, NEO HOOKE", "trusses of .*: expected .*OGDEN"),
     ],
 )  # fmt: skip
 def test_decks_that_are_refused(tmp_path, old, new, message):
@@ -224,20 +168,8 @@ def test_decks_that_are_refused(tmp_path, old, new, message):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message):
         read(tmp_path)
-    assert len(str(caught.value).splitlines()) == 1
-
-
-def test_a_heading_in_latin_1(tmp_path, recording):
-    path = write(tmp_path, skirt())
-    text = "*Heading\n Gr\u00f6\u00dfe der Klappe, *, =\n" + path.read_text()
-    path.write_bytes(text.encode("latin-1"))
-    assert np.array_equal(read(tmp_path).frames, recording.frames)
-    shared = ROOT.parent / "shared" / "data" / "field_inputs" / "latin1.inp"
-    if not shared.is_file():
-        pytest.skip(f"needs {shared}")
-    assert list(Deck(shared).sets["ELSET"]) == ["ALL"]
 
 
 REAL = ({name: f"{name}_Leaflet_Elements" for name in OGDEN}, "Annular_Nodes", "Free_Edge_Nodes")

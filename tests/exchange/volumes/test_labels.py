@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import nibabel
 import nrrd
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from mvest.errors import InputError
 from mvest.exchange._images import Segment
 from mvest.exchange.volumes import LabelMap, read_labels, read_volume
 from mvest.imaging.volume import Modality
-from tests.exchange.volume_variants import by_itk, nifti, philips
+from tests.exchange.volume_variants import philips
 from tests.exchange.volumes import volumes as v
 
 PLACE = {
@@ -77,27 +76,9 @@ def test_layers_of_a_segmentation(tmp_path: Path) -> None:
     ("key", "value"), [("Segment0_Layer", "3"), ("Segment0_LabelValue", "1.5")]
 )
 def test_a_segment_that_cannot_be(tmp_path: Path, key: str, value: str) -> None:
+    keys = {"Segment0_LabelValue": "1", "Segment0_Layer": "0", key: value}
     with pytest.raises(InputError, match=rf"a\.seg\.nrrd: {key}: '{value}', expected a number"):
-        write_layers(tmp_path / "a.seg.nrrd", labels(), **{key: value})
-
-
-def test_frames_over_time_may_be_empty_and_without_a_unit(tmp_path: Path) -> None:
-    path = tmp_path / "a.nii.gz"
-    image = nibabel.load(nifti(tmp_path / "b.nii", "NIfTI-1", "uint8"))
-    made = nibabel.Nifti1Image(np.moveaxis(labels(), 0, 3), image.affine, image.header)
-    nibabel.save(made, path)
-    found = read_labels(path)
-    np.testing.assert_array_equal(found.frames, labels())
-    for unit in ("unknown", "sec"):  # the defaults of nibabel and ITK, no heart's
-        made.header.set_xyzt_units("mm", unit)
-        made.header["pixdim"][4] = 1
-        nibabel.save(made, path)
-        np.testing.assert_array_equal(read_labels(path).frames, labels())
-
-
-def test_metaimage_without_a_unit_of_time(tmp_path: Path) -> None:
-    by_itk(tmp_path / "a.mha")
-    np.testing.assert_array_equal(read_labels(tmp_path / "a.mha").frames, v.frames())
+        write_layers(tmp_path / "a.seg.nrrd", labels(), **keys)
 
 
 def test_a_small_box(tmp_path: Path) -> None:
@@ -115,7 +96,6 @@ def test_what_is_no_label_map(tmp_path: Path) -> None:
     for voxels, words in (
         (np.zeros(v.SHAPE[1:], np.uint8), "data: all voxels are 0, expected labels"),
         (np.full(v.SHAPE[1:], 1.5), "expected whole numbers"),
-        (np.full(v.SHAPE[1:], np.nan), "expected whole numbers"),
     ):
         nrrd.write(str(path), voxels, PLACE)
         with pytest.raises(InputError, match=rf"a\.nrrd: .*{words}"):

@@ -13,8 +13,9 @@ from mvest.imaging.volume import Modality, VolumeSequence
 from tests.exchange.volumes import volumes as v
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])
-@pytest.mark.parametrize("direction", [v.ROTATION, v.MIRRORED], ids=["right", "left"])
+@pytest.mark.parametrize(
+    ("dtype", "direction"), [("uint8", v.ROTATION), ("int16", v.MIRRORED), ("float32", v.ROTATION)]
+)
 def test_a_sequence_is_read_again(tmp_path: Path, dtype: str, direction: np.ndarray) -> None:
     s = v.sequence(dtype, direction)
     made = VolumeSequence(s.frames, s.spacing, direction, s.origin, s.times, Modality.CT)
@@ -32,14 +33,6 @@ def test_a_sequence_is_read_again(tmp_path: Path, dtype: str, direction: np.ndar
     assert b"#" not in again.partition(b"\n\n")[0]
 
 
-def test_a_single_frame(tmp_path: Path) -> None:
-    s = v.sequence()
-    made = VolumeSequence(s.frames[1:2], s.spacing, s.direction, s.origin, s.times[1:2])
-    found = read_volume(write_sequence_nrrd(tmp_path / "a.seq.nrrd", made))
-    np.testing.assert_array_equal(found.frames, made.frames)
-    assert found.times.tolist() == [0.03]
-
-
 def test_slicer_and_itk_read_the_same_sequence(tmp_path: Path) -> None:
     """ITK, on which Slicer builds, takes the frames for components of a vector."""
     made = v.sequence(direction=v.MIRRORED)
@@ -47,9 +40,7 @@ def test_slicer_and_itk_read_the_same_sequence(tmp_path: Path) -> None:
     header = nrrd.read_header(str(path))
     assert header["kinds"] == ["list", "domain", "domain", "domain"]
     assert (header["labels"], header["units"]) == (["time", "", "", ""], ["s", "", "", ""])
-    assert header["axis 0 index type"] == "numeric"
     assert header["axis 0 index values"] == "0.0 0.03 0.08"
-    assert header["DataNodeClassName"] == "vtkMRMLScalarVolumeNode"
     image = SimpleITK.ReadImage(str(path))
     assert image.GetNumberOfComponentsPerPixel() == len(made.frames)
     index = (5, 7, 11)

@@ -43,7 +43,8 @@ def run(job):
         case "simulating":
             from mvest.exchange.external.contract import Command
 
-            Command(("/bin/sh", "-c", PROGRAM)).run(job.folder)
+            with Command(("/bin/sh", "-c", PROGRAM)).started(job.folder) as ended:
+                ended()
         case "estimating":
             Path("at").touch()
             # As a long call of compiled code: no other thread of Python runs meanwhile.
