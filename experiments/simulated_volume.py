@@ -62,19 +62,21 @@ class SimulatedVolumeOptions:
     acquisition: Acquisition = field(default_factory=Acquisition)
 
 
-def simulate_command(given: Sequence[str]) -> int:
+def simulate_command(words: Sequence[str]) -> int:
     """``mvest simulate volume OUT.seq.nrrd [NAME=VALUE ...]``; exit status."""
-    about = [
-        f"{__doc__}\n\nvalve=NAME and mechanics... as in `mvest run`, and:",
-        inspect.getdoc(SimulatedVolumeOptions) or "",
-        defaults_of(SimulatedVolumeOptions),
-    ]
-    example = "mvest simulate volume mine.seq.nrrd valve=prolapse moduli=[5,1.8] seed=7"
-    parser = Parser("mvest simulate", "\n\n".join(about), example)
-    parser.add_argument("what", choices=["volume"])
-    parser.add_argument("target", type=Path, metavar="OUT", help=f"file that ends in {SUFFIX}")
-    parser.add_argument("options", nargs="*", metavar="NAME=VALUE")
-    parsed = parser.parse_intermixed_args(list(given))
+    about = f"{__doc__}\n\nvalve=NAME and mechanics... as in `mvest run`, and:"
+    options = inspect.getdoc(SimulatedVolumeOptions)
+    parser = Parser(
+        "mvest simulate",
+        f"{about}\n\n{options}\n\n{defaults_of(SimulatedVolumeOptions)}",
+        "mvest simulate volume mine.seq.nrrd valve=prolapse moduli=[5,1.8] seed=7",
+        {
+            "what": {"choices": ["volume"], "type": str},
+            "target": {"metavar": "OUT", "help": f"file that ends in {SUFFIX}"},
+            "options": {"nargs": "*", "metavar": "NAME=VALUE", "type": str},
+        },
+    )
+    parsed = parser.parse_intermixed_args(list(words))
     began = time.monotonic()
     volume, truth = write_simulated_volume(parsed.target, parsed.options)
     print(

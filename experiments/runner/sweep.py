@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from experiments.results.estimates import sweep_table
 from experiments.results.published import publish_runs, publish_sweep
 from experiments.runner.cluster import EngineSettings, require_engine
 from experiments.runner.compose import make_plan
-from experiments.runner.engine import run_jobs
+from experiments.runner.engine import execute, run_jobs
 from experiments.runner.job import check_of, require_admissible
 from experiments.runner.jobs import FailedRunError, Request, last_record, nothing_empty
 from experiments.runner.metrics import metrics
@@ -152,6 +153,25 @@ def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]
         # The jobs that ended are on disk.
         say(f"error: the sweep cannot go on ({error}); run the same command again to go on")
     return ended
+
+
+def run_shard(folder: Path, shard: str) -> int:
+    """Run every N-th job of a planned sweep from the I-th on, for a ``shard`` "I/N".
+
+    A failing job is recorded and does not fail the shard, so the exit status is 0.
+
+    Raises an `MvestError` if nothing is planned in the folder, or there is no such shard.
+    """
+    found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", shard)
+    first, step = map(int, found.groups()) if found else (0, 0)
+    if not 1 <= first <= step:
+        raise ConfigurationError(f"shard {shard}, expected I/N with I from 1 to N, for example 2/8")
+    plan = Plan.read(folder, look=False)
+    # Counted over all jobs, done or not, so that no two shards share one.
+    jobs = plan.jobs[first - 1 :: step]
+    failed = sum(not execute(job, plan.written_ns).converged for job in jobs)
+    print(f"shard {shard}: {len(jobs)} jobs, {failed} without an estimate")
+    return 0
 
 
 def collect_sweep(folder: Path) -> int:

@@ -16,12 +16,13 @@ import subprocess
 import sys
 import time
 import urllib.request
+import webbrowser
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
 
 from filelock import FileLock
@@ -29,6 +30,7 @@ from omegaconf import OmegaConf
 
 from experiments.common.progress import PartBar, say
 from experiments.common.records.record import read_record
+from experiments.common.schema import validated
 from experiments.runner.jobs import CONFIG, RESULT, is_done
 from experiments.runner.metrics import Values, implausible, metrics, settings_of
 from experiments.runner.plan import PLAN
@@ -36,6 +38,7 @@ from experiments.sweeps.collected import read_sweep
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.files import sha256_of
 from mvest.processes import Program, environment, python
+from mvest.quantities import within
 from mvest.reading.documents import read_mapping
 
 SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
@@ -157,6 +160,8 @@ def log_run(folder: Path, config: Values) -> None:
 
 def sync(outputs: Path) -> int:
     """Log everything in a folder of outputs that its store lacks; 1 if a file was unreadable."""
+    if not outputs.is_dir():
+        raise InputError(f"{outputs}: there is no such folder")
     counts, swept = Counter[str](), set[Path]()
     for path in [*sorted(outputs.rglob(PLAN)), *sorted(outputs.rglob(RESULT))]:
         try:
@@ -293,6 +298,22 @@ def runs_of(experiment: str, chosen: str) -> list[Any]:
     from mlflow import search_runs
 
     return list(search_runs(None, chosen, experiment_names=[experiment], output_format="list"))
+
+
+def dashboard(outputs: Path, port: int) -> int:
+    """Show the last sweep in MLflow's pages until interrupted; port 0 is any free one.
+
+    Raises an `MvestError` if there is no logged sweep, or the port cannot be used.
+    """
+    validated(Annotated[int, within(0, 65_535, "", "ports; 0: a free one")], port, "--port")
+    try:
+        place, page, title = last_sweep(outputs)
+        with serving(place, port) as (address, server):
+            print(f"{title}: {address}{page}", flush=True)
+            webbrowser.open(address + page)
+            return server.wait()
+    except KeyboardInterrupt:
+        return 0
 
 
 def last_sweep(outputs: Path) -> tuple[str, str, str]:
