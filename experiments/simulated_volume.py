@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from hydra import compose, initialize_config_dir
@@ -93,10 +92,7 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     ``truth.json``, the surfaces of all frames, and the landmarks of the open and the closed frame.
     No estimate reads it.
 
-    Raises
-    ------
-    MvestError
-        An unknown name, an inadmissible value, or a valve that does not close.
+    Raises an `MvestError` if a name is unknown, a value inadmissible, or the valve does not close.
     """
     sequence_path(target)
     configured = [word for word in words if word.partition("=")[0].split(".")[0] in CONFIGURED]
@@ -127,7 +123,7 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     truth = target.with_name(target.name.removesuffix(SUFFIX) + "_truth")
     truth.mkdir(exist_ok=True)
     true = true_sequence(valve, probe)
-    facts: dict[str, Any] = {
+    facts = {
         "simulated": True,
         "command": " ".join(["mvest simulate volume", target.name, *words]),
         "moduli_MPa": moduli,

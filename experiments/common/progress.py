@@ -53,7 +53,7 @@ def say(text: str) -> None:
 
 
 class Heartbeat:
-    """Writes what goes on whenever nothing was written for `SILENCE_S`; redraws a visible bar.
+    """Writes the status whenever nothing was written for `SILENCE_S`; redraws a visible bar.
 
     Parameters
     ----------
@@ -64,13 +64,18 @@ class Heartbeat:
 
     def __init__(self, bar: Any, status: Callable[[], str]) -> None:
         self._bar, self._status, self._ended = bar, status, threading.Event()
-        self.last = time.monotonic()
+        self.last = self.began = time.monotonic()
         threading.Thread(target=self._beat, daemon=True).start()
 
     def say(self, text: str) -> None:
         """Write a line."""
         self.last = time.monotonic()
         say(text)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the beginning."""
+        return time.monotonic() - self.began
 
     def end(self) -> None:
         """Stop, and remove the bar."""
@@ -88,16 +93,13 @@ class Heartbeat:
 class SolveBar:
     """Reports forward solves and steps of a filter; a bar moves with the time steps of a solve.
 
-    How many solves a filter needs is not known beforehand. A typical number is expected, and after
-    that one more at a time.
-
     Parameters
     ----------
     title : str
     steps : int
         Time steps of one solve; 0 for a model that reports none, which gets no bar.
     solves : int
-        Expected number of solves.
+        Expected number of solves; after these, one more at a time is expected.
     names : sequence of str, optional
         Of the parameters, in the order of :meth:`iterate`.
     whole : float
@@ -111,11 +113,11 @@ class SolveBar:
         self._title, self._names, self._expected, self._steps = title, names, solves, steps
         self._solve, self._last, self._made, self._whole = 0, math.inf, 0, whole
         self._spent: list[float] = []
-        self._before: tuple[FloatArray, float] | None = None
-        self._began = self._solve_began = self._now = time.monotonic()
-        hidden = None if steps else True
-        self._bar = tqdm(total=steps, desc=title, unit="step", disable=hidden, leave=False)
+        self._bar = tqdm(
+            total=steps, desc=title, unit="step", disable=None if steps else True, leave=False
+        )
         self._lines = Heartbeat(self._bar, self._status)
+        self._solve_began = self._now = self._lines.began
 
     def __enter__(self) -> SolveBar:
         return self
@@ -140,17 +142,11 @@ class SolveBar:
         """One more iterate of a filter: its number, the parameters (p,) and the objective."""
         self._end_solve()
         self._solve_began = time.monotonic()
-        before = self._before if number else None
-        self._before = m, objective
-        change = "" if before is None else f" ({objective - before[1]:+.2g})"
         names = list(self._names)
         if len(names) != len(m):  # a first stage estimates the moduli alone
             names = [name for name in names if name.startswith("E_f.")]
-        lines = [f"{self._title}, step {number}: objective {objective:.4g}{change}"]
-        for k, (name, value) in enumerate(zip(names, m, strict=False)):
-            moved = "" if before is None else f" ({value - before[0][k]:+.2g})"
-            lines.append(f"{name} {value:.4g}{moved}")
-        self._lines.say(", ".join([*lines, *self._left()]))
+        values = [f"{name} {value:.4g}" for name, value in zip(names, m, strict=False)]
+        self._say(f"step {number}: objective {objective:.4g}", *values)
 
     def _end_solve(self) -> None:
         """Report the forward solve that has ended, if it was not reported yet."""
@@ -159,26 +155,27 @@ class SolveBar:
         spent = self._now - self._solve_began
         self._spent.append(spent)
         if self._now - self._lines.last >= QUICK_S:
-            solve = f"forward solve {self._solve}: {self._made} time steps in {spent:.1f} s"
-            self._lines.say(", ".join([f"{self._title}, {solve}", *self._left()]))
+            self._say(f"forward solve {self._solve}: {self._made} time steps in {spent:.1f} s")
         self._solve_began, self._made, self._last = self._now, 0, math.inf
 
     def _status(self) -> str:
-        """What goes on within a solve."""
-        solve = f"forward solve {max(self._solve, 1)}: {self._made} time steps"
+        """Progress within a solve."""
         of = f" of {self._steps}" if self._steps >= self._made else ""
-        return ", ".join([f"{self._title}, {solve}{of}", *self._left()])
+        solve = f"forward solve {max(self._solve, 1)}: {self._made} time steps{of}"
+        return ", ".join([self._title, solve, *self._left()])
+
+    def _say(self, *parts: str) -> None:
+        self._lines.say(", ".join([self._title, *parts, *self._left()]))
 
     def _left(self) -> list[str]:
-        """The time that has passed, and an estimate of the time left."""
-        elapsed = time.monotonic() - self._began
+        """The elapsed time, and an estimate of the time left."""
+        elapsed = self._lines.elapsed
         text = [f"{duration(elapsed)} elapsed"]
         if self._whole and self._spent:
             left = self._whole * self._spent[0] - elapsed
             return [*text, f"about {duration(left)} left"] if left > 0.1 * elapsed else text
         # The first solve starts from the open valve. Later ones continue it and are quicker.
-        later = self._spent[1:]
-        if not later:
+        if not (later := self._spent[1:]):
             return text
         each = sum(later) / len(later)
         if (more := self._expected - len(self._spent)) > 0:
@@ -193,7 +190,7 @@ class PartBar:
     ----------
     title : str
     total : int
-        Number of pieces; 0 if only the first finished piece tells it.
+        Number of pieces; 0 if it is known only after the first piece.
     unit : str
     workers : int
         Number of pieces in work at a time.
@@ -205,13 +202,12 @@ class PartBar:
         self, title: str, total: int, unit: str, workers: int = 1, *, quiet: bool = False
     ) -> None:
         self._title, self._total, self._unit, self._workers = title, total, unit, workers
-        self._quiet = quiet
-        self._done, self._spent = 0, 0.0
-        self._began = self._last = time.monotonic()
+        self._quiet, self._done, self._spent = quiet, 0, 0.0
         # tqdm's own estimate of the time left knows no workers.
         form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
         self._bar = tqdm(total=total, desc=title, disable=None, leave=False, bar_format=form)
         self._lines = Heartbeat(self._bar, self._status)
+        self._last = self._lines.began
 
     def __enter__(self) -> PartBar:
         return self
@@ -219,7 +215,7 @@ class PartBar:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._lines.end()
         if kind is None and not self._quiet:
-            say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")
+            say(f"{self._title}: done in {duration(self._lines.elapsed)}")
 
     def step(self, total: int | None = None, seconds: float | None = None) -> None:
         """One more piece is done, of ``total`` if given; it took ``seconds``, if given."""
@@ -233,15 +229,15 @@ class PartBar:
         self._bar.update(1)
 
     def left(self) -> float:
-        """Seconds until the last piece is done.
+        """Seconds until the last piece is done, from the mean time of the finished pieces.
 
-        Each remaining piece takes the mean time of those done. Pieces in work are half done on
-        average, and at the end workers wait for the last piece, which cancel.
+        Pieces in work are half done on average, and at the end workers wait for the last piece;
+        these two cancel.
         """
         left = self._total - self._done
         return left / max(1, min(self._workers, left)) * self._spent / max(1, self._done)
 
     def _status(self) -> str:
-        count = f"{self._done} of {self._total or '?'} {self._unit}s"
-        parts = [f"{self._title}: {count}", f"{duration(time.monotonic() - self._began)} elapsed"]
-        return ", ".join([*parts, *([f"about {duration(self.left())} left"] if self._done else [])])
+        left = [f"about {duration(self.left())} left"] if self._done else []
+        count = f"{self._title}: {self._done} of {self._total or '?'} {self._unit}s"
+        return ", ".join([count, f"{duration(self._lines.elapsed)} elapsed", *left])

@@ -111,10 +111,8 @@ def sweep_table(sweep: Sweep) -> DataFrame:
 def write_estimates(folder: Path, target: Path) -> list[Path]:
     """Write the table of a folder (``.csv`` or ``.parquet``), and its data dictionary next to it.
 
-    Raises
-    ------
-    InputError
-        As `estimate_table`; or the name ends otherwise, or a file cannot be written.
+    Raises an `InputError` as `estimate_table`; or the name ends otherwise, or a file cannot be
+    written.
     """
     if target.suffix not in (".csv", ".parquet"):
         raise InputError(f"{target}: expected a name that ends with .csv or .parquet")

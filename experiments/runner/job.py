@@ -170,7 +170,7 @@ def main() -> None:
     with suppress(KeyboardInterrupt), raised():
         for line in requests:
             order = json.loads(line)
-            request = Request.from_json(order)
+            request = build(Request, order)
             with (request.folder / LOG).open("wb") as log:
                 for stream in (1,) if order["aloud"] else (1, 2):
                     os.dup2(log.fileno(), stream)

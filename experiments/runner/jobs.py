@@ -12,7 +12,7 @@ import resource
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -51,38 +51,20 @@ PROCESS, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 class Request:
     """One resolved configuration and its output folder.
 
-    Attributes
-    ----------
-    config_hash : str
-        SHA-256 of everything in the configuration that can change the result.
-    publish_as : str or None
-        Name of its record in the results; None: do not publish it.
-    overrides : tuple of str
-        The request in Hydra's syntax.
-
-    Raises
-    ------
-    ConfigurationError
-        If a setting is outside its range.
+    Raises a `ConfigurationError` if a setting is outside its range.
     """
 
     values: dict[str, Any]
-    config_hash: str
+    config_hash: str  # SHA-256 of everything in the configuration that can change the result
     folder: Path
-    publish_as: str | None = None
-    overrides: tuple[str, ...] = ()
+    publish_as: str | None = None  # name of its record in the results; None: do not publish it
+    overrides: tuple[str, ...] = ()  # the request in Hydra's syntax
 
     def __post_init__(self) -> None:
         require_in_range(self.values)
 
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Request:
-        """The request that :meth:`to_json` wrote; other entries are ignored."""
-        own = {field.name: data[field.name] for field in fields(cls)}
-        return cls(**{**own, "folder": Path(data["folder"]), "overrides": tuple(data["overrides"])})
-
     def to_json(self) -> dict[str, Any]:
-        """Plain data."""
+        """Plain data, from which `experiments.common.schema.build` makes the request again."""
         data = {field.name: getattr(self, field.name) for field in fields(self)}
         return {**data, "folder": str(self.folder)}
 
@@ -103,7 +85,7 @@ class FailedRunError(Exception):
 
 
 def is_done(folder: Path) -> bool:
-    """Whether everything that belongs to the present record is on disk."""
+    """Whether the record and all files that follow from it are on disk."""
     try:
         return (folder / DONE).read_text(encoding="ascii") == sha256_of(folder / RESULT)
     except (OSError, ValueError):
@@ -111,7 +93,7 @@ def is_done(folder: Path) -> bool:
 
 
 def mark_done(folder: Path) -> None:
-    """Write the marker: everything that belongs to the present record is on disk."""
+    """Write the marker: the record and all files that follow from it are on disk."""
     write_atomically(folder / DONE, sha256_of(folder / RESULT))
 
 
@@ -208,10 +190,8 @@ def replace_record(request: Request, result: Result, started: float) -> Record:
 
     The job ``started`` so many seconds after the epoch.
 
-    Raises
-    ------
-    InputError
-        If they cannot be written; the former record and arrays are then still there.
+    Raises an `InputError` if they cannot be written; the former record and arrays are then still
+    there.
     """
     folder = request.folder
     record = stamp(request.values, request.config_hash, result, started)

@@ -96,10 +96,8 @@ class JobLauncher(Launcher):
     ) -> Sequence[JobReturn]:
         """Run jobs.
 
-        Raises
-        ------
-        MvestError, HydraException, OmegaConfBaseException
-            If the request is wrong; then nothing is run.
+        Raises an `MvestError`, `HydraException` or `OmegaConfBaseException` if the request is
+        wrong; then nothing is run.
         """
         # Its import takes seconds, which `--help` must not.
         from experiments.runner.sweep import launch

@@ -69,10 +69,7 @@ def launch(
     tuple of Request
         All jobs of the sweep so far.
 
-    Raises
-    ------
-    MvestError, HydraException, OmegaConfBaseException
-        If the request is wrong.
+    Raises an `MvestError`, `HydraException` or `OmegaConfBaseException` if the request is wrong.
     """
     launcher: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
     launcher.pop("_target_")

@@ -101,10 +101,8 @@ def require_no_password(uri: str | None) -> None:
 def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
     """Point MLflow at a store and an experiment, which are made if missing; yields the address.
 
-    Raises
-    ------
-    TrackingError
-        If the store cannot be opened, or a write in the context fails: one line that names it.
+    Raises a `TrackingError` if the store cannot be opened, or a write in the context fails: one
+    line that names it.
     """
     require_no_password(uri)
     outputs = outputs.resolve()

@@ -26,22 +26,12 @@ NOT_KEPT: dict[str, Any] = {
 
 
 class SweptJob(Frozen):
-    """One job of a sweep.
+    """One job of a sweep, with the seeds ``seed``, ..., ``seed + repeats - 1``."""
 
-    Attributes
-    ----------
-    hash : str
-        First digits of the hash of its configuration.
-    seed, repeats : int
-        Its seeds are ``seed``, ..., ``seed + repeats - 1``.
-    record : Record
-        Its head, see `head_of`.
-    """
-
-    hash: str
+    hash: str  # first digits of the hash of its configuration
     seed: int
     repeats: int = 1
-    record: Record
+    record: Record  # its head, see `head_of`
 
     @property
     def runs(self) -> tuple[EstimateRecord, ...]:
@@ -57,33 +47,17 @@ class SweptJob(Frozen):
 
 
 class Sweep(Frozen):
-    """Jobs that differ in their factors.
+    """Jobs that differ in their factors."""
 
-    Attributes
-    ----------
-    version : int
-        Of this layout.
-    paper : mapping or None
-        The paper's results: ``table``, ``estimate``, ``error_percent``.
-    provenance : Provenance
-        Of the process that collected the jobs; its configuration hash is that of all jobs.
-    commits : tuple of str
-        Those that computed the jobs.
-    settings : mapping
-        The configuration of the first job, without factors and what belongs to a machine.
-    jobs : tuple of SweptJob
-        At least one.
-    """
-
-    version: Literal[4] = 4
+    version: Literal[4] = 4  # of this layout
     name: str
     size: str | None = None
     title: str
     parameters: tuple[str, ...]
-    paper: Mapping[str, Any] | None = None
-    provenance: Provenance
-    commits: tuple[str, ...] = ()
-    settings: Mapping[str, Any] = {}
+    paper: Mapping[str, Any] | None = None  # its ``table``, ``estimate`` and ``error_percent``
+    provenance: Provenance  # of the process that collected the jobs, with the hash of all jobs
+    commits: tuple[str, ...] = ()  # those that computed the jobs
+    settings: Mapping[str, Any] = {}  # of the first job, without factors and paths
     jobs: tuple[SweptJob, ...] = Field(min_length=1)
 
     @property

@@ -94,10 +94,7 @@ STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
 }  # fmt: skip
 """Column -> its meaning, and its value for the converged runs of a setting."""
 
-CAPTIONS = {
-    "": "Errors and intervals along each factor.",
-    "matrix": "Errors over two factors.",
-}
+CAPTIONS = {"": "Errors and intervals along each factor.", "matrix": "Errors over two factors."}
 """End of the file name of a figure -> its caption."""
 
 

@@ -122,20 +122,11 @@ def _verdicts(records: Path) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closing:
-    """A closure from the open valve.
-
-    Attributes
-    ----------
-    model : ClosureModel
-    result : ClosureResult
-        With a frame for each step.
-    normals : (n, 3)
-        Directions of the thickness at the observed vertices.
-    """
+    """A closure from the open valve."""
 
     model: ClosureModel
-    result: ClosureResult
-    normals: FloatArray
+    result: ClosureResult  # with a frame for each step
+    normals: FloatArray  # (n, 3), directions of the thickness at the observed vertices
 
     @property
     def contact_distance_mm(self) -> float:
@@ -201,20 +192,11 @@ def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
 def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequence[str]) -> None:
     """Draw some steps of a closure from the atrium and from the posterior side.
 
-    Parameters
-    ----------
-    part : Figure or SubFigure
-    path : Path
-        An ``.npz`` file with `Closing.arrays`.
-    steps : mapping of int to str
-        Number of a step -> its title. The open orifice of the last one is painted.
-    names : sequence of str
-        Of the leaflets.
+    ``part`` is a figure or part of one, ``path`` an ``.npz`` file with `Closing.arrays`. ``steps``
+    maps numbers of steps to titles; the open orifice of the last one is painted. ``names`` are
+    those of the leaflets.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
+    Raises an `InputError` if the file cannot be read.
     """
     from mvest.problem.fields import case_fields
     from mvest.reporting.case import drawing

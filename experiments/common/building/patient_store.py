@@ -32,10 +32,10 @@ MAX_DRAWS = 5
 
 @dataclass(frozen=True, slots=True)
 class PatientPlace:
-    """Folders of a virtual patient: the case, which an estimator gets, and the sealed truth."""
+    """Folders of a virtual patient."""
 
-    case: Path
-    hidden: Path
+    case: Path  # for the estimator
+    hidden: Path  # the sealed truth
 
     def truth(self) -> tuple[dict[str, Any], dict[str, FloatArray]]:
         """The truth, and frame -> ``(n, 3)`` mm, the true positions of its vertices.

@@ -141,29 +141,15 @@ def observation_errors(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Twin:
-    """A synthetic study.
-
-    Attributes
-    ----------
-    problem : Problem
-        The estimation problem, which knows nothing of the truth.
-    model, truth_model : ClosureModel
-        The estimator's, and a separate one that makes the observation.
-    source : StoredModel or Extrapolated
-        ``truth_model`` with its cache, extrapolated to zero mesh size if requested.
-    truth_values : (p,)
-    valve : Valve
-        The observed surface.
-    observe : callable
-        (model, values= ``(p,)``, rng=) -> an observation of what the model predicts there.
-    """
+    """A synthetic study; its estimation problem knows nothing of the truth."""
 
     problem: Problem
-    model: ClosureModel
-    truth_model: ClosureModel
-    source: StoredModel | Extrapolated
-    truth_values: FloatArray
-    valve: Valve
+    model: ClosureModel  # the estimator's
+    truth_model: ClosureModel  # a separate one, which makes the observation
+    source: StoredModel | Extrapolated  # ``truth_model`` with its cache, extrapolated if requested
+    truth_values: FloatArray  # (p,)
+    valve: Valve  # the observed surface
+    # (model, values= (p,), rng=) -> an observation of what the model predicts there
     observe: Callable[..., TwinData]
 
 

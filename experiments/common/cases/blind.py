@@ -69,25 +69,14 @@ def seal(folder: Path) -> None:
 def estimate_blindly(
     values: Mapping[str, Any], folder: Path, case: Path, sealed: Path, gate: str = NOT_GATED
 ) -> Result:
-    """Personalise a case, or the valve in a volume, in a separate process.
+    """Personalise a ``case``, a folder or the file of a volume over time, in a separate process.
 
-    Parameters
-    ----------
-    values : mapping
-        The configuration; the parts that describe the patient are left out.
-    folder : Path
-        Output folder of the job, which exists.
-    case : Path
-        Folder of the case, or the file of a volume over time.
-    sealed : Path
-        Folder that the process cannot open.
-    gate : str
-        Verdict of the gate on the anatomy.
+    The process cannot open the folder ``sealed``, and gets no part of the configuration that
+    describes the patient. It writes into the job's output ``folder``, which exists. ``gate`` is the
+    verdict of the gate on the anatomy.
 
-    Raises
-    ------
-    InputError
-        If the process left no result; the message ends with its last line of output.
+    Raises an `InputError` if the process left no result; the message ends with its last line of
+    output.
     """
     given = {"volume": str(case)} if case.is_file() else {"case": str(case)}
     request = {

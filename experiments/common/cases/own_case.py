@@ -9,14 +9,7 @@ from typing import Annotated, Any, Literal
 
 from experiments.common.building.closure import mechanics_of, mesh_store
 from experiments.common.progress import PartBar, SolveBar, say
-from experiments.common.records.record import (
-    FIELDS,
-    NOT_GATED,
-    Mesh,
-    Model,
-    Record,
-    has_passed,
-)
+from experiments.common.records.record import FIELDS, NOT_GATED, Mesh, Model, Record, has_passed
 from experiments.common.schema import InputFile, Reads, Values, build, contents
 from experiments.common.study import Result
 from mvest.cases.case import Role, ValveCase
@@ -39,12 +32,7 @@ from mvest.personalisation.design import expect_case
 from mvest.personalisation.model import build_coarse, gate_case, gate_lines, with_pressures
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Expected
-from mvest.personalisation.settings import (
-    CaseChoices,
-    PersonaliseSettings,
-    Prior,
-    with_stiffening,
-)
+from mvest.personalisation.settings import CaseChoices, PersonaliseSettings, Prior, with_stiffening
 from mvest.problem.record import Row
 from mvest.problem.registration import REGISTRATION
 from mvest.quantities import Value
@@ -157,11 +145,7 @@ def run_case(
 
 
 def run_volume(
-    values: Values,
-    file: str | None,
-    imaged: ImagedInput,
-    personal: PersonalSettings,
-    folder: Path,
+    values: Values, file: str | None, imaged: ImagedInput, personal: PersonalSettings, folder: Path
 ) -> Result:
     """Find the valve in the configured volume, write it, and personalise the case it makes."""
     from mvest.reporting.images import write_image_step
@@ -178,10 +162,7 @@ def find_valve(
 ) -> DetectedValve:
     """The valve in the configured volume. A rejected candidate is drawn.
 
-    Raises
-    ------
-    MvestError
-        As `detect_in_volume`, and if no file is configured.
+    Raises an `MvestError` as `detect_in_volume`, and if no file is configured.
     """
     if file is None:
         raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")

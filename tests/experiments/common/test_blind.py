@@ -11,11 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.common.cases import blind
-from experiments.common.cases.blind import (
-    SECRET,
-    estimate_blindly,
-    write_estimate,
-)
+from experiments.common.cases.blind import SECRET, estimate_blindly, write_estimate
 from experiments.common.records.record import Mesh, Model, Result
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown

@@ -8,11 +8,7 @@ import pytest
 from pydantic.fields import FieldInfo
 
 from experiments.common.config import Config, plain, require_in_range
-from experiments.common.schema import (
-    BY_PARAMETER,
-    hints_of,
-    validated,
-)
+from experiments.common.schema import BY_PARAMETER, hints_of, validated
 from experiments.common.study import load_study, study_names
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS

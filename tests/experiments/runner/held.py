@@ -15,10 +15,7 @@ from tests.experiments.runner import fake_worker
 PROGRAM = "trap '' TERM HUP INT; sleep 300 & setsid sleep 300 & : > ../../../at; wait; wait"
 """An external program that ignores signals, with two child processes."""
 
-HELD_FILE = {
-    "writing": "result.json",
-    "drawing": "sweep_debug.png",
-}
+HELD_FILE = {"writing": "result.json", "drawing": "sweep_debug.png"}
 """Stage -> file that is complete but not renamed yet."""
 
 

@@ -16,14 +16,7 @@ from experiments.common.records.record import Record, stamp, write_record
 from experiments.common.study import Result
 from experiments.runner import job as child
 from experiments.runner.engine import WorkerProcess
-from experiments.runner.jobs import (
-    Request,
-    attempt,
-    is_done,
-    last_record,
-    lock,
-    mark_done,
-)
+from experiments.runner.jobs import Request, attempt, is_done, last_record, lock, mark_done
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import write_json
 from tests.places import ROOT
@@ -184,12 +177,7 @@ def test_what_was_computed_outlives_whatever_ends_the_job_after_it(worker, tmp_p
     assert run_in(worker, asked).status == "failed"
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        *("{}", "", "[" * 9999, '{"version": 3, "provenance": 3}'),
-    ],
-)
+@pytest.mark.parametrize("content", [*("{}", "", "[" * 9999, '{"version": 3, "provenance": 3}')])
 def test_a_damaged_result_is_none(worker, tmp_path, content):
     (tmp_path / "result.json").write_text(content)
     mark_done(tmp_path)
@@ -228,10 +216,7 @@ def test_a_second_process_says_that_it_waits_for_the_folder(tmp_path):
             process.communicate()
 
 
-@pytest.mark.parametrize(
-    ("number", "words"),
-    [(errno.ENOLCK, "No locks available")],
-)
+@pytest.mark.parametrize(("number", "words"), [(errno.ENOLCK, "No locks available")])
 def test_a_folder_that_cannot_be_locked_is_named(tmp_path, monkeypatch, number, words):
     def fails(*_):
         raise OSError(number, os.strerror(number))

@@ -45,13 +45,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert provenance.config_hash.startswith(folder.name)
     assert set(provenance.threads.values()) == {"1"}
     names = {path.name for path in folder.iterdir()}
-    assert {
-        "debug.csv",
-        "debug.md",
-        "debug.png",
-        "debug_valve.png",
-        "config.json",
-    } <= names
+    assert {"debug.csv", "debug.md", "debug.png", "debug_valve.png", "config.json"} <= names
     assert not [name for name in names if name.startswith(PREFIX)]
     assert not (tmp_path / "results").exists()
 
@@ -204,10 +198,7 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
 
 FAILURES = {
     "figure": ("matplotlib.figure.Figure.savefig", ValueError("no glyph for U+D800")),
-    "marker": (
-        "experiments.runner.job.mark_done",
-        OSError(28, "No space left on device"),
-    ),
+    "marker": ("experiments.runner.job.mark_done", OSError(28, "No space left on device")),
 }
 
 

@@ -333,10 +333,7 @@ def test_a_run_by_itself_is_held_to_its_memory(run, monkeypatch):
     assert resource.getrlimit(resource.RLIMIT_DATA) == before
 
 
-@pytest.mark.parametrize(
-    ("given", "limit"),
-    [((), 14_400.0), (("time_limit_s=null",), None)],
-)
+@pytest.mark.parametrize(("given", "limit"), [((), 14_400.0), (("time_limit_s=null",), None)])
 def test_jobs_of_a_sweep_have_a_time_limit_unless_it_is_taken_away(run, given, limit):
     status, _, err = run("sweep=debug", "detach=true", *given)
     assert status == 0, err

@@ -16,13 +16,7 @@ from experiments.common.records.record import Record, write_record
 from experiments.runner.jobs import Request, mark_done
 from experiments.runner.metrics import implausible, metrics, settings_of
 from experiments.runner.plan import Plan
-from experiments.runner.tracking import (
-    last_sweep,
-    log_run,
-    opened,
-    require_no_password,
-    runs_of,
-)
+from experiments.runner.tracking import last_sweep, log_run, opened, require_no_password, runs_of
 from experiments.sweeps.collected import Sweep, SweptJob, write_sweep_file
 from mvest.errors import ConfigurationError, InputError
 from mvest.problem.record import EstimateRecord, Spread, Unknown

@@ -3,14 +3,7 @@
 import pytest
 
 from experiments.sweeps.figures import figures_of
-from tests.experiments.sweeps.made_up_sweeps import (
-    TRUTH,
-    failed_run,
-    job,
-    run,
-    starts,
-    sweep,
-)
+from tests.experiments.sweeps.made_up_sweeps import TRUTH, failed_run, job, run, starts, sweep
 
 
 def axes_of(figure, label: str):
