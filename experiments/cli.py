@@ -24,8 +24,7 @@ from mvest.errors import ConfigurationError, InputError
 NUMBA_SETTINGS = Path(".numba_config.yaml")
 """A file that would make numba load compiled code from any folder."""
 
-WIDTH = 100
-"""Characters of a line of help."""
+WIDTH = 100  # characters of a line of help
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,23 +19,15 @@ from mvest.errors import MvestError, message_of
 
 P = ParamSpec("P")
 
-ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that ask a process to stop."""
-
-TRACEBACKS = "HYDRA_FULL_ERROR"
-"""Environment variable that turns tracebacks on."""
-
-AGAIN_S = 0.01
-"""Time after which a signal is sent again that Python has dropped."""
+ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that ask a process to stop
+TRACEBACKS = "HYDRA_FULL_ERROR"  # environment variable that turns tracebacks on
+AGAIN_S = 0.01  # time after which a signal is sent again that Python has dropped
 
 
 class Interruption(KeyboardInterrupt):
     """Signal ``number`` stopped this process.
 
-    Attributes
-    ----------
-    status : int
-        Exit status as a shell counts: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP.
+    ``status`` is the exit status: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP.
     """
 
     def __init__(self, number: int) -> None:

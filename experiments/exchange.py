@@ -69,7 +69,7 @@ def _parsed(
     convert = found[name][0]
     kind: Any = typing.get_type_hints(convert)["options"]
     about = "\n\n".join(filter(None, map(inspect.getdoc, (convert, kind))))
-    arguments = {
+    arguments: dict[str, dict[str, Any]] = {
         "source": {"metavar": "SOURCE"},
         "target": {"metavar": metavar},
         "options": {"metavar": "OPTION=VALUE", "nargs": "*", "type": str},

@@ -30,8 +30,7 @@ from mvest.simulation.motion import DrawnValve, MotionSettings, close_in_motion
 
 SUFFIX = ".seq.nrrd"
 
-CONFIGURED = ("valve", "mechanics")
-"""Groups of the configuration with the valve and its mechanics."""
+CONFIGURED = ("valve", "mechanics")  # groups of the configuration with the valve and its mechanics
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,7 @@ CONF = next(
 )
 """Hydra's configuration: in the package as it is installed, beside it in a checkout."""
 
-EXPERIMENTS = CONF / "experiment"
-"""One YAML file an experiment."""
+EXPERIMENTS = CONF / "experiment"  # one YAML file an experiment
 
 GATE_RECORDS = CHECKOUT / "results" / "records" / "gate.jsonl"
 """Kept records of the gate in a checkout; an installation has none."""

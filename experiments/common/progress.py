@@ -18,17 +18,13 @@ from tqdm import tqdm
 
 from mvest.typing import FloatArray
 
-SILENCE_S = 10.0
-"""Longest time without a sign of life."""
-
-WIDTH = 100
-"""Characters of a line of a terminal."""
+SILENCE_S = 10.0  # longest time without a sign of life
+WIDTH = 100  # characters of a line of a terminal
 
 TYPICAL_SOLVES = 6
 """Forward solves that a filter usually needs; only the first guess of what is left."""
 
-QUICK_S = 1.0
-"""A forward solve that ends sooner than this after the last line gets no line."""
+QUICK_S = 1.0  # a forward solve that ends sooner than this after the last line gets no line
 
 
 def duration(seconds: float) -> str:
@@ -53,14 +49,7 @@ def say(text: str) -> None:
 
 
 class Heartbeat:
-    """Writes the status whenever nothing was written for `SILENCE_S`; redraws a visible bar.
-
-    Parameters
-    ----------
-    bar : tqdm
-    status : callable
-        () -> line that says what goes on.
-    """
+    """Writes the status whenever nothing was written for `SILENCE_S`; redraws a visible bar."""
 
     def __init__(self, bar: Any, status: Callable[[], str]) -> None:
         self._bar, self._status, self._ended = bar, status, threading.Event()
@@ -93,18 +82,10 @@ class Heartbeat:
 class SolveBar:
     """Reports forward solves and steps of a filter; a bar moves with the time steps of a solve.
 
-    Parameters
-    ----------
-    title : str
-    steps : int
-        Time steps of one solve; 0 for a model that reports none, which gets no bar.
-    solves : int
-        Expected number of solves; after these, one more at a time is expected.
-    names : sequence of str, optional
-        Of the parameters, in the order of :meth:`iterate`.
-    whole : float
-        Expected time of everything in units of the first solve, if solves are not most of it; 0: it
-        follows from the expected number of solves.
+    ``steps`` is the number of time steps of one solve; 0 for a model that reports none, which gets
+    no bar. ``solves`` are expected, and after these one more at a time. ``names`` are those of the
+    parameters of :meth:`iterate`. If solves are not most of the work, ``whole`` is the expected
+    time of everything in units of the first solve.
     """
 
     def __init__(
@@ -186,16 +167,8 @@ class SolveBar:
 class PartBar:
     """A bar over the equal pieces of one part of a study, and a line when the part is done.
 
-    Parameters
-    ----------
-    title : str
-    total : int
-        Number of pieces; 0 if it is known only after the first piece.
-    unit : str
-    workers : int
-        Number of pieces in work at a time.
-    quiet : bool
-        Write no line at the end.
+    ``total`` is the number of pieces, 0 if it is known only after the first one; ``workers`` pieces
+    are in work at a time. ``quiet`` writes no line at the end.
     """
 
     def __init__(

@@ -28,8 +28,7 @@ from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
 from mvest.reading.documents import parse_json
 
-RECORDS = "records"
-"""Folder of the records within the results."""
+RECORDS = "records"  # folder of the records within the results
 
 
 def publish_as(

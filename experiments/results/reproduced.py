@@ -10,8 +10,7 @@ from experiments.results.published import records_of
 from mvest.errors import InputError
 from mvest.reporting.markup import number
 
-SAME = 1e-5
-"""Relative difference of estimates between machines and versions of libraries."""
+SAME = 1e-5  # relative difference of estimates between machines and versions of libraries
 
 
 def compared(table: str, own: Path, published: Path) -> str:

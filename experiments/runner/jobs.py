@@ -35,8 +35,7 @@ HYDRA = ".hydra"
 UNWRITTEN = f"the estimate is in {{}}/{RESULT}, and the same command writes what is missing"
 """Message for a job whose record is on disk while another file could not be written."""
 
-HASH_DIGITS = 16
-"""Digits of its hash by which a job is named."""
+HASH_DIGITS = 16  # digits of its hash by which a job is named
 
 TIME_LIMIT_S = 14_400.0
 """s, default for jobs of sweeps: 50 times the longest of those in ``results/`` (269 s)."""
@@ -49,10 +48,7 @@ PROCESS, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One resolved configuration and its output folder.
-
-    Raises a `ConfigurationError` if a setting is outside its range.
-    """
+    """One configuration in its ranges (or a `ConfigurationError`), and its output folder."""
 
     values: dict[str, Any]
     config_hash: str  # SHA-256 of everything in the configuration that can change the result
@@ -100,8 +96,8 @@ def mark_done(folder: Path) -> None:
 def last_record(folder: Path, config_hash: str, *, cut_off: bool = False) -> Record | None:
     """The record of the last attempt; None if there is none of this version and configuration.
 
-    It is a failure, or a success that is done. With ``cut_off`` it is a success that is not done:
-    a file that follows from it could not be written.
+    It is a failure, or a success that is done; with ``cut_off`` it is a success that is not done,
+    because a file that follows from it could not be written.
     """
     try:
         record = read_record(folder / RESULT)
@@ -150,10 +146,7 @@ def attempt(
 
 
 def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
-    """Lock the folder until the context or this process ends; prints a note if it has to wait.
-
-    Raises an `InputError` if the folder cannot be locked.
-    """
+    """Lock a folder, or raise an `InputError`; prints a note if it has to wait."""
     held = FileLock(folder / LOCK)
     try:
         try:
@@ -168,18 +161,13 @@ def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
 def make_way(request: Request) -> None:
     """Remove what an unfinished attempt left, except a record whose outputs are missing.
 
-    A finished record stays until its replacement is complete. A note reports a changed record.
+    A finished record stays until its replacement is complete.
     """
     folder = request.folder
     adopt_arrays(folder / RESULT)
     remove_parts(folder)
     if is_done(folder):
         return
-    if (folder / DONE).exists():
-        try:
-            read_record(folder / RESULT)
-        except InputError as error:
-            print(f"note: {error}; it is computed again", file=sys.stderr)
     if request.values["force"] or not last_record(folder, request.config_hash, cut_off=True):
         for name in (DONE, RESULT):
             (folder / name).unlink(missing_ok=True)
@@ -202,10 +190,7 @@ def replace_record(request: Request, result: Result, started: float) -> Record:
 
 
 def write_failure(request: Request, reason: str, started: float) -> Record:
-    """Record why a job has no estimate, as `replace_record` does.
-
-    If it had already computed its estimate, that record stays, and a warning says so.
-    """
+    """Record why a job has no estimate; an estimate that was computed stays, with a warning."""
     computed = last_record(request.folder, request.config_hash, cut_off=True)
     if computed is not None:
         remedy = UNWRITTEN.format(request.folder)
@@ -221,10 +206,7 @@ def failed_record(request: Request, reason: str) -> Record:
 
 
 def write_hydra(request: Request) -> None:
-    """Write the resolved configuration and the overrides where Hydra's users expect them.
-
-    Raises an `InputError` if they cannot be written.
-    """
+    """Write configuration and overrides where users of Hydra expect them."""
     place = request.folder / HYDRA
     place.mkdir(exist_ok=True)
     for name, data in (("config", request.values), ("overrides", list(request.overrides))):

@@ -18,8 +18,7 @@ ALWAYS = (
 )  # fmt: skip
 """Settings that every run shows, overridden or not."""
 
-LARGEST_ERROR = 1.0
-"""Relative error of a modulus beyond which an estimate is implausible."""
+LARGEST_ERROR = 1.0  # relative error of a modulus beyond which an estimate is implausible
 
 
 def metrics(record: Record) -> dict[str, float]:

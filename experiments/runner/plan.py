@@ -25,14 +25,12 @@ from mvest.provenance import config_hash, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line
 
-PLAN = "plan.json"
-"""File in a sweep's folder that lists its jobs."""
+PLAN = "plan.json"  # file in a sweep's folder that lists its jobs
 
 NOT_COMMON = ("factors", "paths", "tracking", "sweep")
 """Settings that differ between jobs, or that belong to a machine or the runner."""
 
-NOT_RUN = "not run"
-"""Reason of a job that never began or was interrupted."""
+NOT_RUN = "not run"  # reason of a job that never began or was interrupted
 
 
 def earlier(jobs: Iterable[Request]) -> dict[str, Record]:
@@ -80,10 +78,7 @@ class Plan:
                 )
 
     def write(self) -> Plan:
-        """Write ``plan.json`` into the sweep's folder; returns the plan with `written_ns`.
-
-        The first configuration is written whole, of the others only the differences.
-        """
+        """Write ``plan.json``, of later jobs only the differences to the first one."""
         self.folder.mkdir(parents=True, exist_ok=True)
         place, created = self.folder / PLAN, time.gmtime()
         jobs = [
@@ -185,10 +180,7 @@ class Plan:
         return "\n".join(lines)
 
     def collect(self, ended: Mapping[str, Record]) -> Sweep:
-        """The results of all jobs, in their order; failed and missing jobs are included.
-
-        ``ended`` maps hashes of configurations to heads of records of jobs that have just run.
-        """
+        """All results in order, failed and missing ones too; ``ended`` has heads of new records."""
         known, first = {**self.before, **ended}, self.common
         sources = [
             known[one.config_hash].provenance for one in self.jobs if one.config_hash in known

@@ -34,8 +34,7 @@ from mvest.files import require_writable, write_atomically
 MULTIRUN, TABLE = "multirun.yaml", "jobs.parquet"
 """Files in a sweep's folder: its configuration as Hydra writes it, and a table of all jobs."""
 
-PLANNED = "planned"
-"""The sweeper that knows the grids of ``sweep=NAME``."""
+PLANNED = "planned"  # the sweeper that knows the grids of ``sweep=NAME``
 
 GIVEN_ONCE = (PLANNED, "basic")
 """Sweepers that know all their jobs beforehand; others may try a job twice."""
@@ -50,24 +49,10 @@ def launch(
 ) -> tuple[list[JobReturn], tuple[Request, ...]]:
     """Compose the jobs of a batch, refuse a wrong one before anything is written, and run them.
 
-    Parameters
-    ----------
-    config : DictConfig
-        The sweep's own configuration, with Hydra's part.
-    loader : ConfigLoader
-    overrides : sequence of sequence of str
-        Those of each job.
-    first : int
-        Number of the first of them in the sweep.
-    before : sequence of Request
-        Jobs of earlier batches of the same sweep.
-
-    Returns
-    -------
-    list of JobReturn
-        One for each job, with its objective; empty if jobs were only planned or checked.
-    tuple of Request
-        All jobs of the sweep so far.
+    ``config`` is the sweep's own configuration with Hydra's part, ``overrides`` are those of each
+    job, ``first`` is the number of the first one in the sweep, and ``before`` are the jobs of
+    earlier batches. Returns the result of each job with its objective, none if jobs were only
+    planned or checked, and all jobs of the sweep so far.
 
     Raises an `MvestError`, `HydraException` or `OmegaConfBaseException` if the request is wrong.
     """
@@ -185,10 +170,7 @@ def collect_sweep(folder: Path) -> int:
 
 
 def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
-    """Write, show and publish the results of a sweep.
-
-    Raises an `MvestError` if the results cannot be written.
-    """
+    """Write, show and publish the results of a sweep; raises an `MvestError` if it cannot."""
     found = collected(plan, ended)
     print(text_of(found))
     for path in write_sweep(plan.folder, found):

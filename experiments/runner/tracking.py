@@ -47,8 +47,7 @@ SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
 FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
 """Files that MLflow keeps a copy of."""
 
-MANY = 1000
-"""A sweep with more jobs is one run of MLflow, without runs for its jobs."""
+MANY = 1000  # a sweep with more jobs is one run of MLflow, without runs for its jobs
 
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
 """Tags: the sweep's run of a job; the hash of the result, set when a run is logged completely."""
@@ -65,12 +64,10 @@ MANNERS = {
 ARTIFACTS, SQLITE = "mlartifacts", "sqlite:///"
 """Folder of MLflow's copies in the outputs; beginning of a local database's address."""
 
-PASSWORD = re.compile(r"://[^/@:]*:[^/@]+@")
 BROKEN = re.compile(r"malformed|not a database|no such (table|column)|out-of-date database schema")
 """Messages of SQLite and MLflow about a file that is no database, damaged, or incomplete."""
 
-MOST = 100
-"""Largest number of runs on MLflow's page of comparison, which reads them one by one."""
+MOST = 100  # largest number of runs on MLflow's page of comparison, which reads them one by one
 
 SERVED = MANNERS | {
     "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
@@ -90,7 +87,7 @@ class TrackingError(MvestError):
 
 def require_no_password(uri: str | None) -> None:
     """Raise a `ConfigurationError` for an address with a password."""
-    if uri is not None and PASSWORD.search(uri):
+    if uri is not None and re.search(r"://[^/@:]*:[^/@]+@", uri):
         raise ConfigurationError(
             "tracking.uri holds a password, which would be written into every config.json; leave "
             "it out and put it in ~/.pgpass or MLFLOW_TRACKING_PASSWORD"
@@ -168,25 +165,21 @@ def sync(outputs: Path) -> int:
                 swept |= {path.parent / job["folder"] for job in read.get("jobs", ())}
                 counts += _log(path.parent, outputs, read.get("values", read))
         except (MvestError, OSError, KeyError) as error:
-            counts["left"] += _left_out(path, error)
+            say(f"warning: {path} left out: {error}")
+            counts["left"] += 1
     print(f"{outputs}: {counts['added']} runs added to MLflow, {counts['there']} were there")
     return int(counts["left"] > 0)
 
 
-def _left_out(path: Path, error: Exception) -> int:
-    say(f"warning: {path} left out: {error}")
-    return 1
-
-
 class Entry(NamedTuple):
-    """A run for MLflow; its first tag identifies it, ``seconds`` is the time of its computation."""
+    """A run for MLflow."""
 
     result: Path
     name: str
-    tags: Values
+    tags: Values  # the first one identifies the run
     settings: Values
     numbers: dict[str, float]
-    seconds: float
+    seconds: float  # of its computation
 
 
 def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
@@ -195,7 +188,8 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     if not tracking["enabled"]:
         return counts
     plan: Any = read_mapping(folder / PLAN) if (folder / PLAN).is_file() else None
-    jobs: Any = plan["jobs"] if plan else [{"folder": "", "overrides": _typed(folder)}]
+    typed = list(map(str, OmegaConf.load(folder / TYPED))) if (folder / TYPED).is_file() else []
+    jobs: Any = plan["jobs"] if plan else [{"folder": "", "overrides": typed}]
     shown = jobs if len(jobs) <= MANY else []
     with (
         PartBar(f"{name}, to MLflow", len(shown), "run", quiet=True) as bar,
@@ -213,14 +207,9 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
                 if (place / RESULT).is_file() and (entry := _job(place, job)):
                     counts[_put(entry, known, parent)[1]] += 1
             except (MvestError, KeyError) as error:
-                counts["left"] += _left_out(place, error)
+                say(f"warning: {place} left out: {error}")
+                counts["left"] += 1
     return counts
-
-
-def _typed(folder: Path) -> list[str]:
-    """The overrides of a single run."""
-    place = folder / TYPED
-    return list(map(str, OmegaConf.load(place))) if place.is_file() else []
 
 
 def _job(folder: Path, job: Values) -> Entry | None:

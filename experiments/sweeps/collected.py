@@ -16,8 +16,7 @@ from mvest.problem.registration import unit_of
 from mvest.provenance import require_sealed, sealed
 from mvest.reading.documents import read_mapping, validated
 
-SWEEPS = "sweeps"
-"""Folder of the published sweeps within the results."""
+SWEEPS = "sweeps"  # folder of the published sweeps within the results
 
 NOT_KEPT: dict[str, Any] = {
     "detail": "", "frames": (), "condition_number": None, "distance_to_truth_mm": None,
@@ -83,10 +82,7 @@ def head_of(record: Record) -> Record:
 
 
 def write_sweep_file(path: Path, sweep: Sweep) -> None:
-    """Write a collected sweep with a digest of its content, atomically.
-
-    Raises an `InputError` if it cannot be written.
-    """
+    """Write a sweep with a digest of its content; raises an `InputError` if it cannot."""
     jobs = [job.model_dump(mode="json", exclude_defaults=True) for job in sweep.jobs]
     content = sealed({**sweep.model_dump(mode="json", exclude={"jobs"}), "jobs": jobs})
     text = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
@@ -94,10 +90,7 @@ def write_sweep_file(path: Path, sweep: Sweep) -> None:
 
 
 def read_sweep(path: Path) -> Sweep:
-    """The collected sweep in a file.
-
-    Raises an `InputError` if it cannot be read, is no sweep of this version, or was changed.
-    """
+    """The sweep in a file; raises an `InputError` if it is none or was changed."""
     data = read_mapping(path)
     sweep = validated(Sweep, {k: v for k, v in data.items() if k != "sha256"}, str(path))
     require_sealed(data, str(path))

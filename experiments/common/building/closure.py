@@ -57,10 +57,7 @@ def folder_hash(folder: str | None) -> str | None:
 
 
 def anatomy_of(config: Values) -> Anatomy:
-    """The configured anatomy.
-
-    Raises an `MvestError` if a setting is inadmissible, or the case is faulty.
-    """
+    """The configured anatomy; raises an `MvestError` if it is inadmissible."""
     given = config["valve"]
     if given.get("folder") is None:
         return template_of(config)
@@ -76,10 +73,7 @@ def anatomy_of(config: Values) -> Anatomy:
 
 
 def template_of(config: Values) -> Template:
-    """The configured template.
-
-    Raises a `ConfigurationError` if the anatomy is that of a case folder.
-    """
+    """The template; raises a `ConfigurationError` if the anatomy is that of a folder."""
     if config["valve"].get("folder") is not None:
         raise ConfigurationError(
             f"{config['name']} varies the template's parameters, which the anatomy of a folder has "

@@ -46,10 +46,7 @@ COLUMNS = {
 
 
 def gate_report(values: Values) -> GateReport:
-    """Close the configured anatomy with its true moduli, under variations that must not matter.
-
-    Each result is printed to standard error at once.
-    """
+    """Close the configured anatomy with its true moduli, under variations; prints each result."""
     return run_gate(
         lambda case: closure_model(values, case),
         np.array(values["truth"]["values"], dtype=float),

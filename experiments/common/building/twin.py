@@ -154,10 +154,7 @@ class Twin:
 
 
 def build_twin(config: Values) -> Twin:
-    """A synthetic study from its configuration.
-
-    Raises an `MvestError` if a setting is inadmissible; the message names it.
-    """
+    """A synthetic study; raises an `MvestError` that names an inadmissible setting."""
     parameters, truth = tuple(config["parameters"]), config["truth"]
     settings, R = mechanics_of(config), config["filter"]["R"]
     # Cheap checks come before anything is meshed.
@@ -213,10 +210,7 @@ def build_twin(config: Values) -> Twin:
 
 
 def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[StudyResult]:
-    """One estimate for each seed of the errors; they share the truth and the first closure.
-
-    ``name`` is shown with the progress.
-    """
+    """One estimate for each seed; they share truth and first closure; ``name`` is displayed."""
     of_name = f", {name}" if name else ""
     steps = len(twin.truth_model.settings.protocol.steps())
     with SolveBar(f"observation{of_name}", steps, 1) as bar:

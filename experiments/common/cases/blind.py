@@ -104,10 +104,7 @@ def estimate_blindly(
 
 
 def read_estimate(folder: Path) -> Result:
-    """The result that the process wrote into the output folder.
-
-    Raises an `InputError` if there is none.
-    """
+    """The result in the output folder; raises an `InputError` if there is none."""
     left, arrays = read_mapping(folder / ESTIMATE), folder / ARRAYS
     return Result(**left, arrays=read_npz(arrays) if arrays.is_file() else {})
 

@@ -25,14 +25,9 @@ from mvest.reporting.tables import Table
 if TYPE_CHECKING:
     from mvest.valve.mesh.solid_mesh import SolidMesh
 
-VERSION = 3
-"""Of the layout of a record."""
-
-FIELDS = "fields.npz"
-"""File of a run's arrays, next to its record."""
-
-HASH_DIGITS = 12
-"""Digits of a hash that a line of text shows."""
+VERSION = 3  # of the layout of a record
+FIELDS = "fields.npz"  # file of a run's arrays, next to its record
+HASH_DIGITS = 12  # digits of a hash that a line of text shows
 
 NOT_GATED, PASSED_GATE, FAILED_GATE = "not gated", "passed", "NOT passed"
 """A verdict of the gate on an anatomy begins with one of these."""
@@ -42,10 +37,7 @@ Number: TypeAlias = float | int | str | bool | None
 
 
 class GitState(Frozen):
-    """The commit that computed a record, and whether tracked files differed from it.
-
-    Both are None outside a checkout.
-    """
+    """The commit of a record, and whether tracked files differed; None outside a checkout."""
 
     sha: str | None
     dirty: bool | None
@@ -226,11 +218,8 @@ def here_and_now(config_hash: str, mesh_hash: str, seed: int) -> Provenance:
     )
 
 
-ARRAYS = "arrays_sha256"
-"""In a record's file, the digest of its arrays."""
-
-NEW_FIELDS = f"{PREFIX}{FIELDS}"
-"""Arrays of a record that is about to be written."""
+ARRAYS = "arrays_sha256"  # in a record's file, the digest of its arrays
+NEW_FIELDS = f"{PREFIX}{FIELDS}"  # arrays of a record that is about to be written
 
 
 def write_record(path: Path, record: Record, arrays: Mapping[str, Any] | None = None) -> None:
@@ -282,9 +271,5 @@ def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None)
 
 
 def read_record(path: Path) -> Record:
-    """The record in a file of a run's folder.
-
-    Raises an `InputError` if it cannot be read, is no such record, or was changed since it was
-    written.
-    """
+    """The record in a file; raises an `InputError` if it is none or was changed."""
     return record_from(read_mapping(path), str(path), path.with_name(FIELDS))

@@ -20,8 +20,7 @@ from mvest.reporting.tables import Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LONGEST = 60
-"""Most rows of a table on a page; of a longer one the page names the file."""
+LONGEST = 60  # most rows of a table on a page; of a longer one the page names the file
 
 
 def write_results(folder: Path, study: Study[Any], results: Results) -> list[Path]:
