@@ -153,13 +153,6 @@ def test_the_process_is_given_nothing_of_the_patient(monkeypatch, tmp_path):
     assert not any("4.321" in value or "24680" in value for value in heard.env.values())
 
 
-def test_a_process_that_leaves_nothing_is_told_by_its_last_words(monkeypatch, tmp_path):
-    with pytest.raises(InputError, match="the estimation of case left no result: the case is bad"):
-        asked(monkeypatch, tmp_path, VALUES, None, 2, "note\nerror: the case is bad\n")
-    with pytest.raises(InputError, match="left no result: exit status -9"):
-        asked(monkeypatch, tmp_path, VALUES, None, -9)
-
-
 def test_what_was_configured_of_a_patient_is_sealed(tmp_path):
     (tmp_path / ".hydra").mkdir()
     (tmp_path / ".hydra" / "case.yaml").touch()

@@ -5,7 +5,6 @@ import json
 import math
 import os
 import re
-import resource
 import shutil
 import sys
 from dataclasses import replace
@@ -15,8 +14,7 @@ import pytest
 import yaml
 
 from experiments.results.published import records_of
-from experiments.runner import engine, jobs, plugins, sweep
-from experiments.runner.plan import Plan
+from experiments.runner import engine, plugins, sweep
 from experiments.studies import twin
 from experiments.sweeps.collected import Sweep, read_sweep
 from mvest.files import sha256_of
@@ -229,18 +227,13 @@ WRONG = [
     ),
     (("sweep=debug", "sweep.size=huge"), "sweep.size = 'huge', expected one of small, full"),
     (("sweep=debug", "sed=1,2"), "did you mean seed?"),
+    (("sweep=debug", "hydra/sweeper=basic"), "hydra/sweeper=basic knows no grid"),
     (("sweep=debug", "seed=interval(1,2)"), "does not support sweep type"),
     (("sweep=debug", "hydra.launcher.cluster=PBS"), "hydra.launcher.cluster = PBS, expected"),
     (("sweep=debug", "paths.outputs=file"), "file"),
     (("sweep=debug", "filter.P0=0.01,-1"), "(job filter.initial=[5,3] seed=1 "),
     (("sweep=debug", "filter.initial=[5,3],[5.0,3.0]"), "one and the same: filter.initial=[5,3]"),
 ]  # fmt: skip
-
-
-def test_another_sweeper_does_not_ignore_the_grids_of_a_sweep(run):
-    status, _, err = run("sweep=debug", "hydra/sweeper=basic")
-    assert (status, err.count("\n"), runs()) == (2, 1, [])
-    assert "hydra/sweeper=basic knows no grid" in err
 
 
 @pytest.mark.parametrize(("overrides", "words"), WRONG, ids=[" ".join(o) for o, _ in WRONG])
@@ -313,31 +306,6 @@ def test_a_job_beyond_its_memory_costs_its_own_row(run):
     assert 0.4 < float(found[1]) <= 0.5
     status, _, _ = run("sweep=debug", "memory_limit_gb=0.5")
     assert status == 0
-
-
-def test_a_run_by_itself_is_held_to_its_memory(run, monkeypatch):
-    def hog(job):
-        kept = []
-        while True:
-            kept.append(b"x" * 2**24)
-
-    monkeypatch.setattr(twin, "STUDY", replace(twin.STUDY, run=hog))
-    resident = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-    limit = round(resident / jobs.GB + 0.2, 2)
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    status, _, err = run("experiment=debug", f"memory_limit_gb={limit}")
-    assert status == 1
-    assert err.startswith(f"no estimate: memory limit of {limit:.3g} GB (used: up to ")
-    (record,) = Path("outputs/debug").glob("*/result.json")
-    assert json.loads(record.read_text())["reason"].startswith("memory limit of")
-    assert resource.getrlimit(resource.RLIMIT_DATA) == before
-
-
-@pytest.mark.parametrize(("given", "limit"), [((), 14_400.0), (("time_limit_s=null",), None)])
-def test_jobs_of_a_sweep_have_a_time_limit_unless_it_is_taken_away(run, given, limit):
-    status, _, err = run("sweep=debug", "detach=true", *given)
-    assert status == 0, err
-    assert {job.values["time_limit_s"] for job in Plan.read(DEBUG).jobs} == {limit}
 
 
 def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):
