@@ -21,9 +21,8 @@ from experiments.common.places import CONF, EXPERIMENTS
 from experiments.console import Parser, interruptible
 from mvest.errors import ConfigurationError, InputError
 
+# A file that would make numba load compiled code from any folder.
 NUMBA_SETTINGS = Path(".numba_config.yaml")
-"""A file that would make numba load compiled code from any folder."""
-
 WIDTH = 100  # characters of a line of help
 
 

@@ -25,14 +25,12 @@ from mvest.quantities import OutsideError
 from mvest.reading.text import check_words
 
 T = TypeVar("T")
+# Plain data of a configuration, or of a part of it.
 Values: TypeAlias = Mapping[str, Any]
-"""Plain data of a configuration, or of a part of it."""
-
 MAX_LETTERS = 10_000  # longest text of a setting
 LARGEST = 1e15  # largest number of a setting whose type has no range
-
+# Marks a setting that changes no number of a result; it is left out of the hash.
 NOT_HASHED = "not hashed"
-"""Marks a setting that changes no number of a result; it is left out of the hash."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -29,19 +29,15 @@ from mvest.files import remove_parts, require_writable, sha256_of, write_atomica
 from mvest.provenance import write_json
 
 DONE, RESULT, CONFIG, LOG, LOCK = "done", "result.json", "config.json", "log.txt", ".lock"
+# Files of a job: marker, record, configuration, output, lock, and folder of Hydra's settings.
 HYDRA = ".hydra"
-"""Files of a job: marker, record, configuration, output, lock, and folder of Hydra's settings."""
-
+# Message for a job whose record is on disk while another file could not be written.
 UNWRITTEN = f"the estimate is in {{}}/{RESULT}, and the same command writes what is missing"
-"""Message for a job whose record is on disk while another file could not be written."""
-
 HASH_DIGITS = 16  # digits of its hash by which a job is named
-
+# s, default for jobs of sweeps: 50 times the longest of those in ``results/`` (269 s).
 TIME_LIMIT_S = 14_400.0
-"""s, default for jobs of sweeps: 50 times the longest of those in ``results/`` (269 s)."""
-
+# Share of the machine's memory that all jobs get; and bytes, as Slurm counts them.
 SHARE, GB = 0.8, 2**30
-"""Share of the machine's memory that all jobs get; and bytes, as Slurm counts them."""
 
 PROCESS, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 

@@ -26,10 +26,8 @@ from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line
 
 PLAN = "plan.json"  # file in a sweep's folder that lists its jobs
-
+# Settings that differ between jobs, or that belong to a machine or the runner.
 NOT_COMMON = ("factors", "paths", "tracking", "sweep")
-"""Settings that differ between jobs, or that belong to a machine or the runner."""
-
 NOT_RUN = "not run"  # reason of a job that never began or was interrupted
 
 

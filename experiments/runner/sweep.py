@@ -31,13 +31,11 @@ from experiments.sweeps.report import text_of, write_sweep
 from mvest.errors import ConfigurationError, MvestError
 from mvest.files import require_writable, write_atomically
 
+# Files in a sweep's folder: its configuration as Hydra writes it, and a table of all jobs.
 MULTIRUN, TABLE = "multirun.yaml", "jobs.parquet"
-"""Files in a sweep's folder: its configuration as Hydra writes it, and a table of all jobs."""
-
 PLANNED = "planned"  # the sweeper that knows the grids of ``sweep=NAME``
-
+# Sweepers that know all their jobs beforehand; others may try a job twice.
 GIVEN_ONCE = (PLANNED, "basic")
-"""Sweepers that know all their jobs beforehand; others may try a job twice."""
 
 
 def launch(

@@ -41,16 +41,13 @@ from mvest.processes import Program, environment, python
 from mvest.quantities import within
 from mvest.reading.documents import read_mapping
 
+# Files: the results of a sweep; the overrides of a run.
 SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
-"""Files: the results of a sweep; the overrides of a run."""
-
+# Files that MLflow keeps a copy of.
 FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
-"""Files that MLflow keeps a copy of."""
-
 MANY = 1000  # a sweep with more jobs is one run of MLflow, without runs for its jobs
-
+# Tags: the sweep's run of a job; the hash of the result, set when a run is logged completely.
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
-"""Tags: the sweep's run of a job; the hash of the result, set when a run is logged completely."""
 
 MANNERS = {
     # Give up on an unreachable server after seconds, not minutes.
@@ -61,12 +58,10 @@ MANNERS = {
 }
 """Default settings of MLflow; its server inherits them."""
 
+# Folder of MLflow's copies in the outputs; beginning of a local database's address.
 ARTIFACTS, SQLITE = "mlartifacts", "sqlite:///"
-"""Folder of MLflow's copies in the outputs; beginning of a local database's address."""
-
+# Messages of SQLite and MLflow about a file that is no database, damaged, or incomplete.
 BROKEN = re.compile(r"malformed|not a database|no such (table|column)|out-of-date database schema")
-"""Messages of SQLite and MLflow about a file that is no database, damaged, or incomplete."""
-
 MOST = 100  # largest number of runs on MLflow's page of comparison, which reads them one by one
 
 SERVED = MANNERS | {

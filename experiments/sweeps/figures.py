@@ -31,12 +31,10 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 SPAN = 10.0  # ratio of values from which an axis is logarithmic
-
+# Most values of a factor that get a panel each, and most cells of panels in one row.
 MOST_PANELS, MOST_CELLS = 4, 16
-"""Most values of a factor that get a panel each, and most cells of panels in one row."""
-
+# Most tick labels, characters of a label that is not rotated, and of a line of a label.
 TICKS, SHORT, LINE = 8, 8, 18
-"""Most tick labels, characters of a label that is not rotated, and of a line of a label."""
 
 Values = dict[str, list[Any]]
 

@@ -29,23 +29,17 @@ if TYPE_CHECKING:
 CONVERGED = "converged"
 
 SEED = "seed"  # a factor of this name is a repetition and no setting
-
+# With more settings of a single run each, different numbers count as repetitions.
 MOST_SETTINGS = 150
-"""With more settings of a single run each, different numbers count as repetitions."""
-
 Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution
-
+# Endings of factor names that state a unit.
 ENDINGS = {"mm": "mm", "mpa": "MPa", "mmhg": "mmHg", "s": "s", "percent": "%"}
-"""Endings of factor names that state a unit."""
-
+# Filter coordinates are MPa, or logarithms where the filter works in them.
 COVARIANCE = "filter coordinates²"
-"""Filter coordinates are MPa, or logarithms where the filter works in them."""
-
+# A unit that may differ from row to row, and two columns.
 UNIT, BOUND, ERROR = "unit of the parameter", "Cramér–Rao bound", "signed error"
-"""A unit that may differ from row to row, and two columns."""
-
+# Units of factors without such an ending.
 COVARIANCES = {"P0": COVARIANCE, "Q": COVARIANCE, "R": "mm²"}
-"""Units of factors without such an ending."""
 
 COLUMNS = {
     **dict.fromkeys(("job", "seed", "status", "parameter"), ""), "true value": UNIT, "start": UNIT,

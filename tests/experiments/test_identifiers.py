@@ -14,13 +14,14 @@ from experiments.common.records.record import stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.case import STUDY, Settings
+from mvest.cases.folder import write_case
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality
 from mvest.provenance import write_json
 from tests.exchange import volume_variants
-from tests.experiments.common.test_inputs import own_case, own_program, typed
+from tests.experiments.common.test_inputs import own_program, typed
 from tests.experiments.configured import composed, plain
-from tests.made_up_closure import use
+from tests.made_up_closure import made_up_case, use
 
 NAME, NUMBER, DATE = "DOE^JANE", "MRN0815", "19700131"
 SECRETS = (NAME, "DOE_JANE", NUMBER, DATE)
@@ -106,7 +107,9 @@ def test_no_name_of_a_folder_is_in_the_report_of_a_case(tmp_path: Path, monkeypa
     use(monkeypatch)
     out = tmp_path / "out"
     out.mkdir()
-    values = plain(composed(*own_case(patient), f"paths.outputs={out}"))
+    write_case(patient / "case", made_up_case(0.3, 8.0, np.random.default_rng(1)))
+    words = ["experiment=own_valve", f"case={patient / 'case'}", f"paths.outputs={out}"]
+    values = plain(composed(*words, "personal.mesh.source=structured"))
     result = STUDY.run(Job(values, build(Settings, values), out))
     record = stamp(values, hash_of(values), result, 0.0)
     write_json(out / "config.json", without_places(values))

@@ -28,11 +28,10 @@ if TYPE_CHECKING:
 
 Anatomy: TypeAlias = "Template | GivenValve"
 
+# Cells around and along the leaflets of the coarsest mesh on which a closure is followed.
 COARSEST = (24, 3)
-"""Cells around and along the leaflets of the coarsest mesh on which a closure is followed."""
-
+# Vertices of the surface that an unstructured mesh fills, whatever is observed.
 UNSTRUCTURED_SURFACE = (112, 29)
-"""Vertices of the surface that an unstructured mesh fills, whatever is observed."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,16 +32,10 @@ from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.solid_mesh import embed
 
 COLUMNS = {
-    "time": "s:.2f",
-    "pressure": "mmHg:.0f",
-    "orifice": "mm²:.1f",
-    "coaptation": "mm:.1f",
-    "intersections": "",
-    "chord strain": ":.3f",
-    "chord force": "N:.2f",
-    "smallest det F": ":.2f",
+    "time": "s:.2f", "pressure": "mmHg:.0f", "orifice": "mm²:.1f", "coaptation": "mm:.1f",
+    "intersections": "", "chord strain": ":.3f", "chord force": "N:.2f", "smallest det F": ":.2f",
     "Newton iterations": "",
-}
+}  # fmt: skip
 """Columns of `mvest.scenarios.measures.measure_steps`, with units and digits."""
 
 

@@ -37,14 +37,12 @@ from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
 
+# Files that the process writes into the output folder.
 ESTIMATE, ARRAYS = "estimate.json", "estimate.npz"
-"""Files that the process writes into the output folder."""
-
+# Bytes that the process may allocate. A leaflet that crumples can take all memory there is.
 MAX_MEMORY = 10 * 2**30
-"""Bytes that the process may allocate. A leaflet that crumples can take all memory there is."""
-
+# Parts of a configuration that describe the patient; the estimator does not get them.
 SECRET = ("patient", "echo", "truth", "valve", "seed", "parameters", "row", "factors")
-"""Parts of a configuration that describe the patient; the estimator does not get them."""
 
 
 def seal(folder: Path) -> None:

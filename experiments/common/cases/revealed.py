@@ -27,11 +27,10 @@ from mvest.reporting.tables import Column, Table, table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# An estimate, and the verdict that counts for it.
 Judged: TypeAlias = tuple[EstimateRecord, str]
-"""An estimate, and the verdict that counts for it."""
-
+# Estimates by the name of their scenario, data or filter.
 Groups: TypeAlias = Mapping[str, Sequence[Judged]]
-"""Estimates by the name of their scenario, data or filter."""
 
 NOTHING = dict.fromkeys(("estimate", "std", "low", "high"))
 

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 VERSION = 3  # of the layout of a record
 FIELDS = "fields.npz"  # file of a run's arrays, next to its record
 HASH_DIGITS = 12  # digits of a hash that a line of text shows
-
+# A verdict of the gate on an anatomy begins with one of these.
 NOT_GATED, PASSED_GATE, FAILED_GATE = "not gated", "passed", "NOT passed"
-"""A verdict of the gate on an anatomy begins with one of these."""
 
 Status = Literal["converged", "failed"]
 Number: TypeAlias = float | int | str | bool | None
