@@ -12,12 +12,11 @@ import math
 import os
 import sys
 import traceback
-from itertools import takewhile
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -124,12 +123,8 @@ def explain(error: BaseException) -> str:
         causes.append(cause)
     lines = [line.strip() for e in reversed(causes) for line in str(e).splitlines() if line.strip()]
     text = lines[0] if lines else type(error).__name__
-    listed = [k for k, line in enumerate(lines) if line.startswith("Available options")]
-    if listed:
-        choices = takewhile(
-            lambda line: not line.startswith("Config search path"), lines[listed[0] + 1 :]
-        )
-        known = [name.strip() for name in choices]
+    unknown = [one for one in causes if isinstance(one, MissingConfigException)]
+    if unknown and (known := list(unknown[0].options or ())):
         wrong = text.rpartition("/")[2].strip("'")
         close = difflib.get_close_matches(wrong, known, n=1, cutoff=0.7)
         hint = f"did you mean {close[0]}? " if close else ""

@@ -112,10 +112,9 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
         distance_mm=options.distance_mm,
         tilt_deg=options.tilt_deg,
     )
-    with PartBar("closure of the valve", 1, "closure") as bar:
+    with PartBar("closure of the valve and its echo", 2, "part") as bar:
         valve = close_in_motion(DrawnValve("simulated", template, moduli, mechanics), motion)
         bar.step()
-    with PartBar("echo of all frames", 1, "volume") as bar:
         volume = simulate_volume(valve, options.acquisition, probe, options.seed)
         bar.step()
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -208,10 +208,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
-    """SHA-256 of everything in a configuration, resolved or not, that can change the result.
-
-    A file or folder counts by its content, not by its name.
-    """
+    """SHA-256 of everything that can change the result; files count by content, not by name."""
     values = plain(config) if isinstance(config, DictConfig) else config
     _require_names(values)  # Hydra is about to make a folder of this name
     return config_hash(with_contents(_kinds(values.get("study")), values, hashed=True))

@@ -93,8 +93,7 @@ def estimate_table(folder: Path) -> DataFrame:
         place = path.relative_to(folder).as_posix()
         try:
             if path in tables:
-                found = records_of(folder, path.stem)
-                for name, record in found.records.items() if found else ():
+                for name, record in records_of(folder, path.stem).records.items():
                     rows += _rows(record, f"{place}#{name}")
             elif path in sweeps:
                 rows += _of_sweep(read_sweep(path), place)

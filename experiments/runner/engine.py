@@ -156,10 +156,7 @@ _busy: set[WorkerProcess] = set()
 def run_apart(
     request: Request, requested_ns: int | None = None, at_a_time: int = 1, *, aloud: bool = False
 ) -> Record:
-    """Run a job as `attempt` does, in a worker process.
-
-    ``at_a_time`` jobs share the memory of this machine; for ``aloud`` see `WorkerProcess.run`.
-    """
+    """Run a job as `attempt` does, in a worker process (see `WorkerProcess.run`)."""
     idle = _idle.setdefault(str(Path.cwd()), [])
     try:
         worker = idle.pop()

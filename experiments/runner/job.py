@@ -163,10 +163,7 @@ def main() -> None:
 
 
 def answer(request: Request, memory_gb: float) -> dict[str, Any]:
-    """Run a job; the ``reason`` is None if it wrote its record.
-
-    ``refused`` means that the request is wrong, and that this process may run another one.
-    """
+    """Run a job: the ``reason`` if it wrote no record, and whether the request is ``refused``."""
     try:
         compute(request, memory_gb)
     except Exception as error:

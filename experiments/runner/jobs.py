@@ -155,10 +155,7 @@ def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
 
 
 def make_way(request: Request) -> None:
-    """Remove what an unfinished attempt left, except a record whose outputs are missing.
-
-    A finished record stays until its replacement is complete.
-    """
+    """Remove what an unfinished attempt left, except a record whose outputs are missing."""
     folder = request.folder
     adopt_arrays(folder / RESULT)
     remove_parts(folder)
@@ -212,10 +209,7 @@ def write_hydra(request: Request) -> None:
 
 @contextmanager
 def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
-    """Remove a job's folder, and its parents within the outputs, if nothing was written there.
-
-    Hydra makes the folder before the request is checked.
-    """
+    """Remove a job's folder, which Hydra made, and its parents, if nothing was written there."""
     try:
         yield
     finally:

@@ -57,8 +57,7 @@ def metrics(record: Record) -> dict[str, float]:
 def implausible(record: Record) -> str:
     """Why a run is left out of comparisons; empty if it is plausible.
 
-    It failed, its verdict is that there is no estimate, or the relative error of a modulus exceeds
-    `LARGEST_ERROR`.
+    It failed, its verdict is that there is no estimate, or the error exceeds `LARGEST_ERROR`.
     """
     if not record.converged:
         return "failed"

@@ -98,7 +98,16 @@ def launch(
         return [], jobs
     ended = _run(plan, batch, settings)
     found = {job.hash: job.record for job in finish(plan, ended).jobs}
-    returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
+    returned = []
+    for job in batch.jobs:
+        record, one = found[job.short_hash], JobReturn(job.overrides, working_dir=str(job.folder))
+        one.status = JobStatus.COMPLETED if record.converged else JobStatus.FAILED
+        one.return_value = (
+            metrics(record).get(config.objective, math.nan)
+            if record.converged
+            else FailedRunError(f"{record.reason} (recorded in {job.folder})")
+        )
+        returned.append(one)
     folder, common = plan.folder, plan.common
     del ended, found, plan, batch  # frees ten thousand records before they are logged
     log_run(folder, common)
@@ -155,9 +164,7 @@ def run_shard(folder: Path, shard: str) -> int:
 
 
 def collect_sweep(folder: Path) -> int:
-    """Collect and log the results of a sweep that workers run, also before its end.
-
-    Returns the exit status: 1 if a job has no estimate.
+    """Collect and log a sweep that workers run, also before its end; 1 if a job has no estimate.
 
     Raises an `MvestError` if nothing is planned in the folder, or the results cannot be written.
     """
@@ -209,15 +216,3 @@ def collected(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
     )
     print(f"Written to {path}")
     return found
-
-
-def _returned(job: Request, record: Record, objective: str) -> JobReturn:
-    """The result of a job for Hydra."""
-    returned = JobReturn(overrides=job.overrides, working_dir=str(job.folder))
-    returned.status = JobStatus.COMPLETED if record.converged else JobStatus.FAILED
-    returned.return_value = (
-        metrics(record).get(objective, math.nan)
-        if record.converged
-        else FailedRunError(f"{record.reason} (recorded in {job.folder})")
-    )
-    return returned

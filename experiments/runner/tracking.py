@@ -135,10 +135,7 @@ def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
 
 
 def log_run(folder: Path, config: Values) -> None:
-    """Log a single run or a sweep, with the configuration of its first job.
-
-    A failing store costs a line of warning; every result is on disk.
-    """
+    """Log a run or a sweep; if the store fails, print a warning: every result is on disk."""
     outputs = Path(config["paths"]["outputs"])
     try:
         if (folder / RESULT).is_file() or (folder / PLAN).is_file():
@@ -283,10 +280,7 @@ def runs_of(experiment: str, chosen: str) -> list[Any]:
 
 
 def dashboard(outputs: Path, port: int) -> int:
-    """Show the last sweep in MLflow's pages until interrupted; port 0 is any free one.
-
-    Raises an `MvestError` if there is no logged sweep, or the port cannot be used.
-    """
+    """Show the last sweep in MLflow's pages until interrupted; port 0 is any free one."""
     validated(Annotated[int, within(0, 65_535, "", "ports; 0: a free one")], port, "--port")
     try:
         place, page, title = last_sweep(outputs)

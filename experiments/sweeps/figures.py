@@ -40,10 +40,7 @@ Values = dict[str, list[Any]]
 
 
 def figures_of(sweep: Sweep) -> dict[str, Figure]:
-    """The figures of a sweep by the end of their file names, if there are data.
-
-    ``""`` shows errors and intervals along each factor, ``matrix`` errors over two factors.
-    """
+    """Errors along each factor (``""``) and over two factors (``matrix``), if there are data."""
     runs = runs_of(sweep).frame
     values = values_of(sweep, runs)
     if good_of(runs)["signed error"].isna().all():

@@ -88,10 +88,7 @@ def anatomy_digest(values: Mapping[str, Any]) -> str:
 
 
 def gate_of(values: Mapping[str, Any], records: Path = GATE_RECORDS) -> str:
-    """The verdict on the configured anatomy, with its mesh; `NOT_GATED` if there is none.
-
-    ``records`` is the file of published records of the gate, one a line.
-    """
+    """The published verdict on the configured anatomy, with its mesh, or `NOT_GATED`."""
     return _verdicts(records).get(anatomy_digest(values), NOT_GATED)
 
 

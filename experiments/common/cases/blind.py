@@ -1,9 +1,8 @@
 """Estimates a case in a process that cannot open what the case hides.
 
-The truth of a virtual patient lies in a separate folder. This process runs one estimation, is given
-only the folder of the case, and refuses to open, list or rename anything within the sealed folder.
-Python's audit hooks cannot be removed once they are set (PEP 578). They see what Python opens, not
-what a compiled library or a child program opens by itself.
+The truth of a virtual patient lies in a separate folder. This process gets only the folder of the
+case, and refuses to open, list or rename anything within the sealed folder. Python's audit hooks
+cannot be removed (PEP 578). They do not see what compiled libraries or child programs open.
 """
 
 from __future__ import annotations

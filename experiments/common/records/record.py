@@ -184,10 +184,7 @@ def model_of_values(values: Mapping[str, Any]) -> Model:
 
 
 def stamp(values: Mapping[str, Any], config_hash: str, result: Result, started: float) -> Record:
-    """The record of what a study returned for a resolved configuration.
-
-    The job ``started`` so many seconds after the epoch.
-    """
+    """The record of a result; the job ``started`` so many seconds after the epoch."""
     found = {name: getattr(result, name) for name in Result.model_fields if name != "arrays"}
     found["row"] = result.row or values["row"]
     found["parameters"] = result.parameters or tuple(values["parameters"])
