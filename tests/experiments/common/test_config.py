@@ -60,21 +60,10 @@ def test_what_within_a_part_changes_no_number_is_no_part_of_the_hash() -> None:
 
 
 def test_the_usual_overrides_reach_the_objects() -> None:
-    config = plain(
-        composed(
-            "experiment=debug",
-            "filter=iterated",
-            "truth.values=[4.5,3.2]",
-            "filter.initial=[8,1.5]",
-            "filter.P0=[1,4]",
-            "mechanics.element=tet4",
-            "mechanics.reading=C",
-            "mesh.layers=1",
-            "observation.noise_mm=0.5",
-            "filter.R=[0.01,0.25]",
-        )
-    )
-    twin = build_twin(config)
+    words = ["filter=iterated", "truth.values=[4.5,3.2]", "filter.initial=[8,1.5]",
+             "mechanics.element=tet4", "mechanics.reading=C", "observation.noise_mm=0.5",
+             "filter.P0=[1,4]", "filter.R=[0.01,0.25]"]  # fmt: skip
+    twin = build_twin(plain(composed("experiment=debug", *words)))
     assert list(twin.truth_values) == [4.5, 3.2]
     assert list(twin.problem.prior.mean) == [8.0, 1.5]
     assert twin.problem.prior.covariance.diagonal().tolist() == [1.0, 4.0]

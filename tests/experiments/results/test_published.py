@@ -85,7 +85,7 @@ def test_every_committed_record_is_as_it_was_written() -> None:
     assert {"table1", "population", "volume"} <= set(tables)
     for table in tables:
         found = records_of(ROOT / "results", table)
-        assert found is not None
+        assert found.records
         assert all(record.table == table for record in found.records.values())
 
 

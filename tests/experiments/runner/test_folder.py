@@ -88,14 +88,6 @@ def test_a_kill_while_arrays_and_record_are_replaced_loses_neither(tmp_path, mon
     assert number(asked) == (2.0 if step == "adopt_arrays" else 1.0)
 
 
-def test_another_configurations_result_stays_until_it_is_replaced(tmp_path):
-    asked = request(tmp_path)
-    finish(asked, 1.0)
-    jobs.make_way(Request(asked.values, "1" * 64, tmp_path))
-    assert number(asked) == 1.0
-    assert jobs.last_record(tmp_path, "1" * 64) is None
-
-
 def test_a_request_keeps_its_overrides(tmp_path):
     plain = request(tmp_path)
     asked = Request(plain.values, plain.config_hash, tmp_path, None, ("seed=2", "+a='b c'"))

@@ -3,9 +3,8 @@
 import json
 import os
 import signal
-import subprocess
 import sys
-import time
+import threading
 from pathlib import Path
 
 import pytest
@@ -13,8 +12,7 @@ import pytest
 from experiments.common.records.record import Record, stamp, write_record
 from experiments.common.study import Result
 from experiments.runner.engine import WorkerProcess
-from experiments.runner.jobs import Request, attempt, is_done, last_record, mark_done
-from tests.places import ROOT
+from experiments.runner.jobs import Request, attempt, is_done, last_record, lock, mark_done
 
 OBEDIENT = """
 import json, os, sys, time
@@ -43,38 +41,19 @@ def run_in(worker: WorkerProcess, asked: Request) -> Record:
     return attempt(asked, lambda: worker.run(asked))
 
 
-TRUTH = {
-    "values": [1.0],
-    "refine": 1,
-    **dict.fromkeys(("element", "source", "columns", "rows", "layers")),
-}
-
-MESH = {"columns": 1, "rows": 1, "layers": 1, "source": "structured", "edge_length": 2.5}
+VALUES = {
+    "study": "twin", "name": "a", "title": "b", "row": "c", "table": "d", "paper": None, "seed": 1,
+    "parameters": ["x"], "factors": {"k": 1}, "filter": {"initial": [2.0], "mode": "paper"},
+    "truth": {"values": [1.0], "refine": 1,
+              **dict.fromkeys(("element", "source", "columns", "rows", "layers"))},
+    "observation": {"noise_mm": 0.0}, "mechanics": {"element": "hex18", "tissue": {}},
+    "mesh": {"columns": 1, "rows": 1, "layers": 1, "source": "structured", "edge_length": 2.5},
+    "tracking": {"enabled": False}, "force": False, "figures": False, "memory_limit_gb": None,
+}  # fmt: skip
 
 
 def request(folder: Path, **order) -> Request:
-    values = {
-        **{
-            "study": "twin",
-            "name": "a",
-            "title": "b",
-            "row": "c",
-            "table": "d",
-            "paper": None,
-            "seed": 1,
-        },
-        **{"parameters": ["x"], "factors": {"k": 1}, "truth": TRUTH},
-        **{"filter": {"initial": [2.0], "mode": "paper"}, "observation": {"noise_mm": 0.0}},
-        **{
-            "mechanics": {"element": "hex18", "tissue": {}},
-            "tracking": {"enabled": False},
-            "force": False,
-        },
-        **{"mesh": MESH, "figures": False},
-        "time_limit_s": order.pop("limit", None),
-        "memory_limit_gb": None,
-        "order": order,
-    }
+    values = VALUES | {"time_limit_s": order.pop("limit", None), "order": order}
     return Request(values, "0" * 64, folder)
 
 
@@ -132,8 +111,7 @@ def test_a_healthy_process_is_kept_and_another_is_replaced(worker, tmp_path):
     assert second != first
     os.kill(second, signal.SIGKILL)
     # Found dead between two jobs, it costs none.
-    while Path(f"/proc/{second}").exists() and worker._program.process.poll() is None:
-        time.sleep(0.01)
+    worker._program.process.wait(60)
     assert pid() not in (first, second)
 
 
@@ -168,32 +146,16 @@ def test_a_damaged_or_changed_result_is_none(worker, tmp_path, content):
     assert run_in(worker, request(tmp_path, exit=3)).status == "failed"
 
 
-def test_a_second_process_says_that_it_waits_for_the_folder(tmp_path):
-    code = (
-        "import sys; from pathlib import Path; from experiments.runner.jobs import lock\n"
-        "with lock(Path(sys.argv[1])): print('in', flush=True); sys.stdin.read()"
-    )
-
-    def start():
-        return subprocess.Popen(
-            [sys.executable, "-c", code, str(tmp_path)],
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    processes = [start()]
-    try:
-        assert processes[0].stdout.readline() == "in\n"
-        processes.append(start())
-        waits = f"waiting for another process that works in {tmp_path}\n"
-        assert processes[1].stderr.readline() == waits
-        # The lock falls with whoever held it, however it ended.
-        processes[0].kill()
-        assert processes[1].stdout.readline() == "in\n"
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
+def test_who_finds_the_folder_locked_waits_and_says_so(tmp_path, capsys):
+    first = lock(tmp_path)
+    second = threading.Thread(target=lambda: lock(tmp_path).lock.release())
+    second.start()
+    waits = f"waiting for another process that works in {tmp_path}\n"
+    said = ""
+    while not said:
+        said = capsys.readouterr().err
+    assert said == waits
+    assert second.is_alive()
+    first.lock.release()
+    second.join(60)
+    assert not second.is_alive()

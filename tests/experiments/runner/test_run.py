@@ -28,38 +28,24 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert finished.returncode == 0, finished.stderr
     assert "E_f.anterior (MPa)" in finished.stdout
     (folder,) = (tmp_path / "outputs" / "debug").iterdir()
-    # Read with its types, every field there.
     record = read_record(folder / "result.json")
-    provenance = record.provenance
     (first,) = record.estimates
     assert record.converged
-    assert record.parameters == ("E_f.anterior", "E_f.posterior")
-    assert record.reason
     assert record.forward_solves > first.iterations > 0
-    assert first.seconds > 0
     # Two estimated moduli, and the four that follow from them.
     assert [unknown.kind for unknown in first.unknowns] == ["modulus"] * 2 + ["derived"] * 4
-    assert all(unknown.std > 0 for unknown in first.moduli)
-    assert first.distance_mm.max >= first.distance_mm.mean
     assert max(abs(unknown.relative_error) for unknown in first.unknowns) < 1e-4
-    assert provenance.config_hash.startswith(folder.name)
-    assert set(provenance.threads.values()) == {"1"}
+    assert record.provenance.config_hash.startswith(folder.name)
+    assert set(record.provenance.threads.values()) == {"1"}
     names = {path.name for path in folder.iterdir()}
     assert {"debug.csv", "debug.md", "debug.png", "debug_valve.png", "config.json"} <= names
     assert not [name for name in names if name.startswith(PREFIX)]
-    assert not (tmp_path / "results").exists()
 
     with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
-        assert database.execute("select name from experiments where name = 'debug'").fetchall()
         tags = dict(database.execute("select key, value from tags").fetchall())
         metrics = dict(database.execute("select key, value from latest_metrics").fetchall())
-        settings = dict(database.execute("select key, value from params").fetchall())
-    assert tags["config_hash"] == provenance.config_hash
-    assert tags["status"] == "converged"
-    assert {"mlflow.user", "mlflow.source.git.commit", "result_hash", "plausible"} <= set(tags)
+    assert tags["config_hash"] == record.provenance.config_hash
     assert metrics["estimate.anterior"] == pytest.approx(first.moduli[0].estimate)
-    assert settings["mechanics.element"] == "hex18"
-    assert len(list((tmp_path / "outputs" / "mlartifacts").rglob("result.json"))) == 1
 
 
 ERRORS = [

@@ -201,23 +201,14 @@ def test_an_experiment_of_several_runs_keeps_a_record_of_each(run, monkeypatch):
     usual = ("experiment=mesh_independence", "paths.results=published")
     status, _, err = run(*usual)
     assert status == 0, err
-    names = [
-        "mesh-independence-hex18-structured-36-x-4",
-        "mesh-independence-hex18-structured-36-x-8",
-        "mesh-independence-hex18-structured-40-x-5",
-        "mesh-independence-hex18-structured-54-x-6",
-        "mesh-independence-hex18-structured-72-x-8",
-    ]
-    kept = records_of(Path("published"), "mesh_independence")
-    assert kept is not None
-    assert list(kept.records) == names
+    names = [f"mesh-independence-hex18-structured-{n}" for n in
+             ("36-x-4", "36-x-8", "40-x-5", "54-x-6", "72-x-8")]  # fmt: skip
+    assert list(records_of(Path("published"), "mesh_independence").records) == names
     # What was done before is taken over where the results have lost it.
     shutil.rmtree("published")
     assert run(*usual)[0] == 0
     assert len(runs()) == 5
-    kept = records_of(Path("published"), "mesh_independence")
-    assert kept is not None
-    assert list(kept.records) == names
+    assert list(records_of(Path("published"), "mesh_independence").records) == names
 
 
 WRONG = [
