@@ -218,13 +218,18 @@ WRONG = [
     ),
     (("sweep=debug", "sweep.size=huge"), "sweep.size = 'huge', expected one of small, full"),
     (("sweep=debug", "sed=1,2"), "did you mean seed?"),
-    (("sweep=debug", "hydra/sweeper=basic"), "hydra/sweeper=basic knows no grid"),
     (("sweep=debug", "seed=interval(1,2)"), "does not support sweep type"),
     (("sweep=debug", "hydra.launcher.cluster=PBS"), "hydra.launcher.cluster = PBS, expected"),
     (("sweep=debug", "paths.outputs=file"), "file"),
     (("sweep=debug", "filter.P0=0.01,-1"), "(job filter.initial=[5,3] seed=1 "),
     (("sweep=debug", "filter.initial=[5,3],[5.0,3.0]"), "one and the same: filter.initial=[5,3]"),
 ]  # fmt: skip
+
+
+def test_another_sweeper_does_not_ignore_the_grids_of_a_sweep(run):
+    status, _, err = run("sweep=debug", "hydra/sweeper=basic")
+    assert (status, err.count("\n"), runs()) == (2, 1, [])
+    assert "hydra/sweeper=basic knows no grid" in err
 
 
 @pytest.mark.parametrize(("overrides", "words"), WRONG, ids=[" ".join(o) for o, _ in WRONG])
