@@ -11,22 +11,19 @@ import pkgutil
 import re
 import sys
 import textwrap
-from argparse import Namespace
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import mvest
 from experiments.common.places import CONF, EXPERIMENTS
 from experiments.console import Parser, interruptible
 from mvest.errors import ConfigurationError, InputError
 
+# A file that would make numba load compiled code from any folder.
 NUMBA_SETTINGS = Path(".numba_config.yaml")
-"""A file that would make numba load compiled code from any folder."""
-
-WIDTH = 100
-"""Characters of a line of help."""
+WIDTH = 100  # characters of a line of help
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,31 +34,36 @@ class Command:
     ----------
     about, example : str
         For the help.
-    run : callable or str
-        Parsed arguments -> exit status; or the name of a function that gets the words themselves.
-    arguments : mapping
-        Name -> arguments of `argparse.ArgumentParser.add_argument`.
+    run : str
+        Full name of a function that returns an exit status, or paths to print.
+    arguments : mapping or None
+        Arguments of the function, see `Parser`; None: it gets the words themselves.
     """
 
     about: str
     example: str
-    run: Callable[[Namespace], int] | str
-    arguments: dict[str, dict[str, Any]] = field(default_factory=dict)
+    run: str
+    arguments: dict[str, dict[str, Any]] | None = None
 
-    def parser(self, name: str) -> Parser:
-        """The parser of its arguments, which are paths unless they say otherwise."""
-        parser = Parser(f"mvest {name}", self.about, f"mvest {name} {self.example}".rstrip())
-        for one, how in self.arguments.items():
-            path = {} if "action" in how else {"type": Path}
-            parser.add_argument(one, **{**path, **how})
-        return parser
+    def __call__(self, name: str, words: list[str]) -> int:
+        """Run the command of that name; returns the exit status."""
+        if self.arguments is None:
+            return int(pkgutil.resolve_name(self.run)(words))
+        example = f"mvest {name} {self.example}".rstrip()
+        parser = Parser(f"mvest {name}", self.about, example, self.arguments)
+        # Imported after the arguments were checked: some of these modules take seconds.
+        parsed = vars(parser.parse_intermixed_args(words))
+        result = pkgutil.resolve_name(self.run)(**parsed)
+        if isinstance(result, int):
+            return result
+        print(*result, sep="\n")
+        return 0
 
 
 @interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command on its arguments, those of the command line by default; the exit status."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    name, rest = (given[0], given[1:]) if given else ("--help", [])
+    """Run the command on its arguments, by default those of the command line; the exit status."""
+    name, *words = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if NUMBA_SETTINGS.exists():
         raise InputError(f"{NUMBA_SETTINGS}: numba would obey this file; start from another folder")
     if name in ("-h", "--help", "--version"):
@@ -71,10 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         close = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(COMMANDS)}"
         raise ConfigurationError(f"{name}: no such command; {hint}")
-    command = COMMANDS[name]
-    if isinstance(command.run, str):
-        return int(pkgutil.resolve_name(command.run)(rest))
-    return command.run(command.parser(name).parse_intermixed_args(rest))
+    return COMMANDS[name](name, words)
 
 
 def _help() -> str:
@@ -84,83 +83,19 @@ def _help() -> str:
     return "\n".join([about, "", *lines, "", more])
 
 
-def _list(_: Namespace) -> int:
-    print(listing(experiments_in(EXPERIMENTS)))
-    return 0
+def list_experiments() -> list[str]:
+    """Every experiment and its sentence, in two columns."""
+    sentences = experiments_in(EXPERIMENTS)
+    first = max(map(len, sentences)) + 2
+    form = textwrap.TextWrapper(WIDTH, subsequent_indent=" " * first)
+    return [form.fill(name.ljust(first) + text) for name, text in sentences.items()]
 
 
-def _tables(parsed: Namespace) -> int:
-    from experiments.results.published import regenerate
-
-    print(*regenerate(parsed.folder), sep="\n")
-    return 0
-
-
-def _table(parsed: Namespace) -> int:
-    from experiments.results.estimates import write_estimates
-
-    print(*write_estimates(parsed.folder, parsed.target), sep="\n")
-    return 0
-
-
-def _collect(parsed: Namespace) -> int:
-    from experiments.runner.sweep import collect_sweep
-
-    return collect_sweep(parsed.folder)
-
-
-def _sync(parsed: Namespace) -> int:
-    from experiments.runner.tracking import sync
-
-    for folder in parsed.folders:
-        if not folder.is_dir():
-            raise InputError(f"{folder}: there is no such folder")
-    return max(map(sync, parsed.folders))
-
-
-def _dashboard(parsed: Namespace) -> int:
-    """Serve MLflow's pages until it is interrupted."""
-    import webbrowser
-
-    from experiments.common.schema import validated
-    from experiments.runner.tracking import last_sweep, serving
-    from mvest.quantities import within
-
-    validated(Annotated[int, within(0, 65_535, "", "ports; 0: a free one")], parsed.port, "--port")
-    try:
-        place, page, title = last_sweep(parsed.folder)
-        with serving(place, parsed.port) as (address, server):
-            print(f"{title}: {address}{page}", flush=True)
-            webbrowser.open(address + page)
-            return server.wait()
-    except KeyboardInterrupt:
-        return 0
-
-
-def _worker(parsed: Namespace) -> int:
-    """Run a shard of a sweep; a failing job is recorded and does not fail the worker."""
-    from experiments.runner.engine import execute
-    from experiments.runner.plan import Plan
-
-    found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", parsed.shard)
-    first, step = (int(found[1]), int(found[2])) if found else (0, 0)
-    if not 1 <= first <= step:
-        raise ConfigurationError(
-            f"shard {parsed.shard}, expected I/N with I from 1 to N, for example 2/8"
-        )
-    plan = Plan.read(parsed.folder, look=False)
-    # Every N-th job of the list, done or not: no two shards share one.
-    jobs = plan.jobs[first - 1 :: step]
-    failed = sum(not execute(job, plan.written_ns).converged for job in jobs)
-    print(f"shard {parsed.shard}: {len(jobs)} jobs, {failed} without an estimate")
-    return 0
-
-
-def _completion(parsed: Namespace) -> int:
-    """Print a completion script with the words of all commands."""
+def completion(shell: str) -> list[str]:
+    """A completion script with the words of all commands."""
     cases = []
     for name, command in COMMANDS.items():
-        words = ["--help", *(one for one in command.arguments if one.startswith("-"))]
+        words = ["--help", *(one for one in command.arguments or () if one.startswith("-"))]
         if name == "run":
             words += ["-m", *(f"{group}={one}" for group, of in groups().items() for one in of)]
         if name in ("import", "export"):
@@ -169,9 +104,8 @@ def _completion(parsed: Namespace) -> int:
         words += ["volume"] if name == "simulate" else []
         words += ["bash", "zsh"] if name == "completion" else []
         cases.append(f'    {name}) words="{" ".join(words)}" ;;')
-    start = "autoload -U +X bashcompinit && bashcompinit\n" if parsed.shell == "zsh" else ""
-    print(start + SCRIPT.format(commands=" ".join(COMMANDS), cases="\n".join(cases)))
-    return 0
+    start = "autoload -U +X bashcompinit && bashcompinit\n" if shell == "zsh" else ""
+    return [start + SCRIPT.format(commands=" ".join(COMMANDS), cases="\n".join(cases))]
 
 
 SCRIPT = r"""_mvest() {{
@@ -243,23 +177,27 @@ def named(word: str) -> str:
     raise ConfigurationError(f"{word}: no such experiment; {hint}")
 
 
-def _one_path(experiment: str, setting: str) -> Callable[[Namespace], int]:
-    """A command that runs an experiment on one file or folder."""
+def own_valve(path: Path, check: bool, overrides: list[str]) -> int:
+    """Run the experiment of a case folder."""
+    if path.is_file():
+        raise InputError(
+            f"{path}: a file, expected a folder with case.yaml; for a volume over time: "
+            f"mvest volume {path}"
+        )
+    return _run_path("experiment=own_valve", "case", path, check, overrides)
 
-    def run(parsed: Namespace) -> int:
-        for override in parsed.overrides:
-            if "=" not in override:
-                raise ConfigurationError(f"{override}: expected NAME=VALUE; one path at a time")
-        if setting == "case" and parsed.path.is_file():
-            raise InputError(
-                f"{parsed.path}: a file, expected a folder with case.yaml; for a volume over time: "
-                f"mvest volume {parsed.path}"
-            )
-        check = ["check=true"] if parsed.check else []
-        own = [f"experiment={experiment}", f"{setting}={quoted(str(parsed.path))}"]
-        return run_command([*own, *check, *parsed.overrides])
 
-    return run
+def volume(path: Path, check: bool, overrides: list[str]) -> int:
+    """Run the experiment of a volume over time."""
+    return _run_path("experiment=volume", "volume", path, check, overrides)
+
+
+def _run_path(experiment: str, setting: str, path: Path, check: bool, overrides: list[str]) -> int:
+    for override in overrides:
+        if "=" not in override:
+            raise ConfigurationError(f"{override}: expected NAME=VALUE; one path at a time")
+    checked = ["check=true"] if check else []
+    return run_command([experiment, f"{setting}={quoted(str(path))}", *checked, *overrides])
 
 
 def quoted(text: str) -> str:
@@ -270,24 +208,15 @@ def quoted(text: str) -> str:
 
 def experiments_in(folder: Path) -> dict[str, str]:
     """Name of every experiment -> first sentence of its leading comment, or else its title."""
-    return {path.stem: _sentence(path) for path in sorted(folder.glob("*.yaml"))}
-
-
-def _sentence(path: Path) -> str:
-    text = path.read_text(encoding="utf-8")
-    (comment,) = re.findall(r"\A(?:#.*\n)*", text)
-    lines = [line.lstrip("# ") for line in comment.splitlines() if "@package" not in line]
-    if found := re.match(r".+?[.?!](?=\s|$)", " ".join(lines)):
-        return found[0]
-    title = re.search(r"^title: *(.*)$", text, re.M)
-    return title[1].strip("'\"") if title else ""
-
-
-def listing(sentences: dict[str, str]) -> str:
-    """Experiments and their sentences in two columns."""
-    first = max(map(len, sentences), default=0) + 2
-    form = textwrap.TextWrapper(WIDTH, subsequent_indent=" " * first)
-    return "\n".join(form.fill(name.ljust(first) + text) for name, text in sentences.items())
+    found = {}
+    for path in sorted(folder.glob("*.yaml")):
+        text = path.read_text(encoding="utf-8")
+        (comment,) = re.findall(r"\A(?:#.*\n)*", text)
+        lines = [line.lstrip("# ") for line in comment.splitlines() if "@package" not in line]
+        sentence = re.match(r".+?[.?!](?=\s|$)", " ".join(lines))
+        title = re.search(r"^title: *(.*)$", text, re.M)
+        found[path.stem] = sentence[0] if sentence else title[1].strip("'\"") if title else ""
+    return found
 
 
 def _of(metavar: str, help_: str, **more: Any) -> dict[str, Any]:
@@ -303,7 +232,9 @@ MORE = {
 SWEPT = _of("FOLDER", "of the sweep, in outputs/")
 
 COMMANDS: dict[str, Command] = {
-    "list": Command("the experiments, one sentence each", "", _list),
+    "list": Command(
+        "the experiments, one sentence each", "", "experiments.cli.list_experiments", {}
+    ),
     "run": Command(
         "an experiment with Hydra's overrides; with -m a sweep",
         "table1 seed=2",
@@ -312,13 +243,13 @@ COMMANDS: dict[str, Command] = {
     "own-valve": Command(
         "moduli of a valve from a case folder",
         "examples/case --check",
-        _one_path("own_valve", "case"),
+        "experiments.cli.own_valve",
         {"path": _of("FOLDER", "folder with case.yaml"), **MORE},
     ),
     "volume": Command(
         "moduli of a valve from a volume over time (NRRD, MetaImage, NIfTI, Philips DICOM)",
         "examples/volume.seq.nrrd imaged.pressure_mmHg=120",
-        _one_path("volume", "volume"),
+        "experiments.cli.volume",
         {"path": _of("FILE", "volume over time"), **MORE},
     ),
     "simulate": Command(
@@ -339,13 +270,13 @@ COMMANDS: dict[str, Command] = {
     "tables": Command(
         "every table, figure and page of results/ again, from the records in it",
         "results",
-        _tables,
-        {"folder": _of("FOLDER", "of results", nargs="?", default="results")},
+        "experiments.results.published.regenerate",
+        {"results": _of("FOLDER", "of results", nargs="?", default="results")},
     ),
     "table": Command(
         "all estimates of a folder as one table for statistics",
         "outputs estimates.csv",
-        _table,
+        "experiments.results.estimates.write_estimates",
         {
             "folder": _of("FOLDER", "of runs, or results/"),
             "target": _of("FILE", "NAME.csv or NAME.parquet"),
@@ -354,34 +285,34 @@ COMMANDS: dict[str, Command] = {
     "worker": Command(
         "run a share of a planned sweep's jobs, under any scheduler",
         "outputs/sweep_noise --shard 2/8",
-        _worker,
+        "experiments.runner.sweep.run_shard",
         {"folder": SWEPT, "--shard": _of("I/N", "I from 1 to N", default="1/1", type=str)},
     ),
     "collect": Command(
         "collect the results of a sweep that workers ran",
         "outputs/sweep_noise",
-        _collect,
+        "experiments.runner.sweep.collect_sweep",
         {"folder": SWEPT},
     ),
     "sync": Command(
         "log to MLflow what is on disk and not there",
         "outputs",
-        _sync,
-        {"folders": _of("FOLDER", "of runs", nargs="*", default=[Path("outputs")])},
+        "experiments.runner.tracking.sync",
+        {"outputs": _of("FOLDER", "of runs", nargs="?", default="outputs")},
     ),
     "dashboard": Command(
         "MLflow's pages, on the comparison of the last sweep",
         "outputs --port 0",
-        _dashboard,
+        "experiments.runner.tracking.dashboard",
         {
-            "folder": _of("FOLDER", "of runs", nargs="?", default="outputs"),
+            "outputs": _of("FOLDER", "of runs", nargs="?", default="outputs"),
             "--port": _of("PORT", "0: a free one", default=5000, type=int),
         },
     ),
     "completion": Command(
         'completion of commands: put eval "$(mvest completion bash)" into ~/.bashrc',
         "bash",
-        _completion,
+        "experiments.cli.completion",
         {"shell": {"type": str, "choices": ["bash", "zsh"], "help": "bash or zsh"}},
     ),
 }

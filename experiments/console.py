@@ -9,32 +9,25 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
-from typing import NoReturn, ParamSpec
+from typing import Any, NoReturn, ParamSpec
 
 from mvest.errors import MvestError, message_of
 
 P = ParamSpec("P")
 
-ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that ask a process to stop."""
-
-TRACEBACKS = "HYDRA_FULL_ERROR"
-"""Environment variable that turns tracebacks on."""
-
-AGAIN_S = 0.01
-"""Time after which a signal is sent again that Python has dropped."""
+ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that ask a process to stop
+TRACEBACKS = "HYDRA_FULL_ERROR"  # environment variable that turns tracebacks on
+AGAIN_S = 0.01  # time after which a signal is sent again that Python has dropped
 
 
 class Interruption(KeyboardInterrupt):
     """Signal ``number`` stopped this process.
 
-    Attributes
-    ----------
-    status : int
-        Exit status as a shell counts: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP.
+    ``status`` is the exit status: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP.
     """
 
     def __init__(self, number: int) -> None:
@@ -130,14 +123,22 @@ class _Form(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpF
 class Parser(argparse.ArgumentParser):
     """A parser of a command's words that refuses wrong ones in one line.
 
-    ``example`` is shown at the end of the help.
+    ``example`` is shown at the end of the help. ``arguments`` maps names to arguments of
+    `argparse.ArgumentParser.add_argument`; an argument is a path unless it has another type.
     """
 
-    def __init__(self, command: str, about: str, example: str, usage: str | None = None) -> None:
-        shown = f"example: {example}"
-        super().__init__(
-            command, description=about, epilog=shown, usage=usage, formatter_class=_Form
-        )
+    def __init__(
+        self,
+        command: str,
+        about: str,
+        example: str,
+        arguments: Mapping[str, Mapping[str, Any]],
+        usage: str | None = None,
+    ) -> None:
+        super().__init__(command, usage, about, epilog=f"example: {example}", formatter_class=_Form)
+        for name, given in arguments.items():
+            default = {} if "action" in given else {"type": Path}
+            self.add_argument(name, **{**default, **given})
 
     def error(self, message: str) -> NoReturn:
         """Print it and exit with status 2."""

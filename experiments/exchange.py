@@ -29,9 +29,9 @@ EXAMPLES = {
 }
 
 
-def import_command(given: Sequence[str]) -> int:
+def import_command(words: Sequence[str]) -> int:
     """``mvest import NAME SOURCE CASE [OPTION=VALUE ...]``: write a case folder; exit status."""
-    convert, source, target, options = _parsed("import", importing, "CASE", given)
+    convert, source, target, options = _parsed("import", importing, "CASE", words)
     require_new(target)  # before a minute of reading
     case = convert(source, options)
     write_case(target, case)
@@ -40,15 +40,15 @@ def import_command(given: Sequence[str]) -> int:
     return 0
 
 
-def export_command(given: Sequence[str]) -> int:
+def export_command(words: Sequence[str]) -> int:
     """``mvest export NAME SOURCE TARGET [OPTION=VALUE ...]``; exit status."""
-    convert, source, target, options = _parsed("export", exporting, "TARGET", given)
+    convert, source, target, options = _parsed("export", exporting, "TARGET", words)
     print(f"wrote {convert(source, target, options)}")
     return 0
 
 
 def _parsed(
-    verb: str, package: ModuleType, metavar: str, given: Sequence[str]
+    verb: str, package: ModuleType, metavar: str, words: Sequence[str]
 ) -> tuple[Callable[..., Any], Path, Path, Any]:
     """The function that converts, its source and target, and its options."""
     found = {}
@@ -56,22 +56,26 @@ def _parsed(
         module = importlib.import_module(f"{package.__name__}.{one.name}")
         if function := getattr(module, f"{verb}_{one.name}", None):
             found[one.name] = function, (module.__doc__ or "").partition("\n")[0]
-    name = given[0] if given else "--help"
+    name, *rest = words or ["--help"]
     if name not in found:
         form = textwrap.TextWrapper(WIDTH, initial_indent="  ", subsequent_indent=" " * 15)
         names = "\n".join(form.fill(f"{key:<12} {text}") for key, (_, text) in found.items())
-        more = f"mvest {verb} NAME --help lists the options of each."
+        about = f"{names}\n\nmvest {verb} NAME --help lists the options of each."
         usage = f"mvest {verb} NAME SOURCE {metavar} [OPTION=VALUE ...]"
-        parser = Parser(f"mvest {verb}", f"{names}\n\n{more}", EXAMPLES[verb], usage)
+        parser = Parser(f"mvest {verb}", about, EXAMPLES[verb], {}, usage)
         if name.startswith("-"):
             parser.parse_args(["--help"])
         parser.error(f"{name}: nothing to {verb} by this name; known: {', '.join(found)}")
-    convert, _ = found[name]
+    convert = found[name][0]
     kind: Any = typing.get_type_hints(convert)["options"]
-    about = [inspect.getdoc(convert), inspect.getdoc(kind), defaults_of(kind)]
-    parser = Parser(f"mvest {verb} {name}", "\n\n".join(filter(None, about)), EXAMPLES[verb])
-    parser.add_argument("source", type=Path, metavar="SOURCE")
-    parser.add_argument("target", type=Path, metavar=metavar)
-    parser.add_argument("options", nargs="*", metavar="OPTION=VALUE")
-    parsed = parser.parse_intermixed_args(list(given[1:]))
-    return convert, parsed.source, parsed.target, from_words(name, kind, parsed.options)
+    about = "\n\n".join(filter(None, map(inspect.getdoc, (convert, kind))))
+    arguments: dict[str, dict[str, Any]] = {
+        "source": {"metavar": "SOURCE"},
+        "target": {"metavar": metavar},
+        "options": {"metavar": "OPTION=VALUE", "nargs": "*", "type": str},
+    }
+    parser = Parser(
+        f"mvest {verb} {name}", f"{about}\n\n{defaults_of(kind)}", EXAMPLES[verb], arguments
+    )
+    given = parser.parse_intermixed_args(rest)
+    return convert, given.source, given.target, from_words(name, kind, given.options)

@@ -12,15 +12,11 @@ import math
 import os
 import sys
 import traceback
-from collections.abc import Sequence
-from itertools import takewhile
 from pathlib import Path
-from typing import NoReturn
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -32,12 +28,6 @@ from experiments.console import TRACEBACKS, interruptible
 from experiments.runner.jobs import RESULT, FailedRunError, Request, nothing_empty
 from experiments.runner.plugins import FailedSweepError, register_plugins
 from mvest.errors import ConfigurationError, MvestError
-
-PRIMARY = "In 'config': "
-"""How Hydra begins messages about the primary configuration."""
-
-RESOLVING = "ConfigurationError raised while resolving interpolation: "
-"""How OmegaConf begins messages about an error in one of our resolvers."""
 
 
 @interruptible
@@ -61,7 +51,6 @@ def main() -> int:
     # Hydra then passes exceptions on, which become one line here.
     os.environ[TRACEBACKS] = "1"
     try:
-        _require_options(sys.argv[1:])
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
         for error in ended:
             raise error
@@ -71,7 +60,10 @@ def main() -> int:
         print(f"no estimate: {error}", file=sys.stderr)
         return 1
     except Exception as error:
-        if wants_tracebacks or not _from_hydra(error):
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        within_hydra = str(frame.f_globals.get("__name__")).startswith("hydra.")
+        is_theirs = isinstance(error, HydraException | OmegaConfBaseException)
+        if wants_tracebacks or not (is_theirs or (within_hydra and not isinstance(error, OSError))):
             raise
         raise ConfigurationError(explain(error)) from error
     finally:
@@ -83,12 +75,8 @@ def main() -> int:
 def run_alone(config: DictConfig) -> float:
     """One single run: plan, check, or run and log it; returns its objective, or NaN.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible or a file cannot be written.
-    FailedRunError
-        If the computation found no estimate; the run is recorded all the same.
+    Raises an `MvestError` if a setting is inadmissible or a file cannot be written, and a
+    `FailedRunError` if there is no estimate; the run is recorded all the same.
     """
     # Their import takes seconds, which `--help` must not.
     from experiments.results.published import publish_as, publish_runs
@@ -123,25 +111,6 @@ def run_alone(config: DictConfig) -> float:
         return metrics(record).get(config.objective, math.nan)
 
 
-def _require_options(arguments: Sequence[str]) -> None:
-    """Refuse an unknown option in one line; Hydra would complete it or explain it at length."""
-
-    def refuse(message: str) -> NoReturn:
-        raise ConfigurationError(f"{message}; settings are NAME=VALUE, as in experiment=debug")
-
-    parser = get_args_parser()
-    parser.allow_abbrev, parser.error = False, refuse  # type: ignore[method-assign]
-    parser.parse_args(arguments)
-
-
-def _from_hydra(error: Exception) -> bool:
-    if isinstance(error, HydraException | OmegaConfBaseException):
-        return True
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    place = str(frame.f_globals.get("__name__"))
-    return place.startswith("hydra.") and not isinstance(error, OSError)
-
-
 def explain(error: BaseException) -> str:
     """One line about an error: what is wrong and, if known, what would be right."""
     own = [line.strip() for line in str(error).splitlines() if line.strip()]
@@ -154,33 +123,26 @@ def explain(error: BaseException) -> str:
         causes.append(cause)
     lines = [line.strip() for e in reversed(causes) for line in str(e).splitlines() if line.strip()]
     text = lines[0] if lines else type(error).__name__
-    listed = [k for k, line in enumerate(lines) if line.startswith("Available options")]
-    if listed:
-        choices = takewhile(
-            lambda line: not line.startswith("Config search path"), lines[listed[0] + 1 :]
-        )
-        known = [name.strip() for name in choices]
+    unknown = [one for one in causes if isinstance(one, MissingConfigException)]
+    if unknown and (known := list(unknown[0].options or ())):
         wrong = text.rpartition("/")[2].strip("'")
         close = difflib.get_close_matches(wrong, known, n=1, cutoff=0.7)
         hint = f"did you mean {close[0]}? " if close else ""
-        return f"{text.removeprefix(PRIMARY)}; {hint}known: {', '.join(known)}"
-    if refused := text.partition(RESOLVING)[2]:
+        missing = text.removeprefix("In 'config': ")
+        return f"{missing}; {hint}known: {', '.join(known)}"
+    # An error in one of our resolvers.
+    if refused := text.partition("ConfigurationError raised while resolving interpolation: ")[2]:
         return refused
     if isinstance(causes[-1], OmegaConfBaseException):
         full_key = next((line for line in lines if line.startswith("full_key:")), None)
         if full_key is not None:
             text = f"{full_key.removeprefix('full_key:').strip()}: {text}"
-        return text + _nearest(causes[-1])
+        key, parent = (getattr(causes[-1], name, None) for name in ("key", "parent_node"))
+        if key is not None and isinstance(parent, DictConfig) and key not in parent:
+            close = difflib.get_close_matches(str(key), [str(name) for name in parent], n=1)
+            return f"{text}; did you mean {close[0]}?" if close else text
+        return text
     return ": ".join(own[:2]) or type(error).__name__
-
-
-def _nearest(error: BaseException) -> str:
-    """A hint at the setting with the most similar name."""
-    key, parent = getattr(error, "key", None), getattr(error, "parent_node", None)
-    if key is None or not isinstance(parent, DictConfig) or key in parent:
-        return ""
-    close = difflib.get_close_matches(str(key), [str(name) for name in parent], n=1)
-    return f"; did you mean {close[0]}?" if close else ""
 
 
 if __name__ == "__main__":

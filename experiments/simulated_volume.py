@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from hydra import compose, initialize_config_dir
@@ -31,8 +30,7 @@ from mvest.simulation.motion import DrawnValve, MotionSettings, close_in_motion
 
 SUFFIX = ".seq.nrrd"
 
-CONFIGURED = ("valve", "mechanics")
-"""Groups of the configuration with the valve and its mechanics."""
+CONFIGURED = ("valve", "mechanics")  # groups of the configuration with the valve and its mechanics
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,19 +60,21 @@ class SimulatedVolumeOptions:
     acquisition: Acquisition = field(default_factory=Acquisition)
 
 
-def simulate_command(given: Sequence[str]) -> int:
+def simulate_command(words: Sequence[str]) -> int:
     """``mvest simulate volume OUT.seq.nrrd [NAME=VALUE ...]``; exit status."""
-    about = [
-        f"{__doc__}\n\nvalve=NAME and mechanics... as in `mvest run`, and:",
-        inspect.getdoc(SimulatedVolumeOptions) or "",
-        defaults_of(SimulatedVolumeOptions),
-    ]
-    example = "mvest simulate volume mine.seq.nrrd valve=prolapse moduli=[5,1.8] seed=7"
-    parser = Parser("mvest simulate", "\n\n".join(about), example)
-    parser.add_argument("what", choices=["volume"])
-    parser.add_argument("target", type=Path, metavar="OUT", help=f"file that ends in {SUFFIX}")
-    parser.add_argument("options", nargs="*", metavar="NAME=VALUE")
-    parsed = parser.parse_intermixed_args(list(given))
+    about = f"{__doc__}\n\nvalve=NAME and mechanics... as in `mvest run`, and:"
+    options = inspect.getdoc(SimulatedVolumeOptions)
+    parser = Parser(
+        "mvest simulate",
+        f"{about}\n\n{options}\n\n{defaults_of(SimulatedVolumeOptions)}",
+        "mvest simulate volume mine.seq.nrrd valve=prolapse moduli=[5,1.8] seed=7",
+        {
+            "what": {"choices": ["volume"], "type": str},
+            "target": {"metavar": "OUT", "help": f"file that ends in {SUFFIX}"},
+            "options": {"nargs": "*", "metavar": "NAME=VALUE", "type": str},
+        },
+    )
+    parsed = parser.parse_intermixed_args(list(words))
     began = time.monotonic()
     volume, truth = write_simulated_volume(parsed.target, parsed.options)
     print(
@@ -91,10 +91,7 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     ``truth.json``, the surfaces of all frames, and the landmarks of the open and the closed frame.
     No estimate reads it.
 
-    Raises
-    ------
-    MvestError
-        An unknown name, an inadmissible value, or a valve that does not close.
+    Raises an `MvestError` if a name is unknown, a value inadmissible, or the valve does not close.
     """
     sequence_path(target)
     configured = [word for word in words if word.partition("=")[0].split(".")[0] in CONFIGURED]
@@ -115,17 +112,16 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
         distance_mm=options.distance_mm,
         tilt_deg=options.tilt_deg,
     )
-    with PartBar("closure of the valve", 1, "closure") as bar:
+    with PartBar("closure of the valve and its echo", 2, "part") as bar:
         valve = close_in_motion(DrawnValve("simulated", template, moduli, mechanics), motion)
         bar.step()
-    with PartBar("echo of all frames", 1, "volume") as bar:
         volume = simulate_volume(valve, options.acquisition, probe, options.seed)
         bar.step()
     target.parent.mkdir(parents=True, exist_ok=True)
     truth = target.with_name(target.name.removesuffix(SUFFIX) + "_truth")
     truth.mkdir(exist_ok=True)
     true = true_sequence(valve, probe)
-    facts: dict[str, Any] = {
+    facts = {
         "simulated": True,
         "command": " ".join(["mvest simulate volume", target.name, *words]),
         "moduli_MPa": moduli,

@@ -16,6 +16,7 @@ from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+import mvest.quantities as q
 from experiments.common.building.closure import ValveSettings, folder_hash
 from experiments.common.schema import (
     BY_PARAMETER,
@@ -35,38 +36,9 @@ from mvest.imaging.models import MODEL_FILE
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.problem.registration import range_of
 from mvest.provenance import config_hash
-from mvest.quantities import (
-    AxisCount,
-    CellsAlong,
-    CellsAround,
-    EdgeLength,
-    Gigabytes,
-    Layers,
-    Length,
-    Logarithm,
-    Modulus,
-    Percent,
-    Place,
-    PointsAlong,
-    PointsAround,
-    Ratio,
-    Refinement,
-    Repeats,
-    Seed,
-    TimeLimit,
-    Value,
-    Values,
-    within,
-)
 
-GROUP = "study"
-"""The configuration group of the studies."""
-
-MAX_NAME = 120
-"""Letters of a text that names files."""
-
-NAMES = ("name", "table", "study")
-"""Settings that name files and folders, besides ``sweep.name``."""
+MAX_NAME = 120  # letters of a text that names files
+NAMES = ("name", "table", "study")  # settings that name files and folders, besides ``sweep.name``
 
 Switch: TypeAlias = Annotated[bool, NOT_HASHED]
 ByParameter: TypeAlias = Annotated[dict[str, float], BY_PARAMETER]
@@ -78,18 +50,18 @@ class Mesh:
 
     # tetwild: an unstructured mesh of the thickened leaflets
     source: Literal["structured", "tetwild"] = "structured"
-    columns: CellsAround = MISSING
-    rows: CellsAlong = MISSING
-    layers: Layers = 1
-    edge_length: EdgeLength = 2.5  # of an unstructured mesh
+    columns: q.CellsAround = MISSING
+    rows: q.CellsAlong = MISSING
+    layers: q.Layers = 1
+    edge_length: q.EdgeLength = 2.5  # of an unstructured mesh
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContactPoints:
     """Where contact is sampled, in material coordinates: the same for every mesh."""
 
-    columns: PointsAround = 144
-    rows: PointsAlong = 32
+    columns: q.PointsAround = 144
+    rows: q.PointsAlong = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,10 +70,10 @@ class FilterSettings:
 
     mode: str = MISSING  # what tables call the filter
     method: dict[str, Any] = field(default_factory=dict)  # its _target_ and its own settings
-    initial: tuple[Value, ...] = MISSING  # prior mean of the parameters
-    P0: Values = MISSING  # variance, variances or matrix
-    R: Values = 0.01  # mm², one or one for each observed frame
-    R_correlation_mm: Length = 0.0  # correlation length of R along the leaflets; 0: independent
+    initial: tuple[q.Value, ...] = MISSING  # prior mean of the parameters
+    P0: q.Values = MISSING  # variance, variances or matrix
+    R: q.Values = 0.01  # mm², one or one for each observed frame
+    R_correlation_mm: q.Length = 0.0  # correlation length of R along the leaflets; 0: independent
     transform: Literal["identity", "log"] = "identity"
 
 
@@ -110,33 +82,33 @@ class Observation:
     """Which frames and points of the valve are observed, and with which errors."""
 
     frames: tuple[str, ...] = ("open", "closed")
-    columns: PointsAround = 112
-    rows: PointsAlong = 29
+    columns: q.PointsAround = 112
+    rows: q.PointsAlong = 29
     label: str = "none"  # what a table calls its errors
-    noise_mm: Length = 0.0  # SD of independent errors of each coordinate
-    correlated_mm: Length = 0.0  # SD of errors that neighbouring vertices share
-    correlation_length_mm: Length = 5.0
-    dropout_mm: Length = 0.0  # closed vertices closer than this to another leaflet are lost
-    annulus_offset_mm: tuple[Place, ...] = (0.0, 0.0, 0.0)
+    noise_mm: q.Length = 0.0  # SD of independent errors of each coordinate
+    correlated_mm: q.Length = 0.0  # SD of errors that neighbouring vertices share
+    correlation_length_mm: q.Length = 5.0
+    dropout_mm: q.Length = 0.0  # closed vertices closer than this to another leaflet are lost
+    annulus_offset_mm: tuple[q.Place, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
     """The model that makes the synthetic observation; null: as in the estimator's model."""
 
-    values: tuple[Value, ...] = MISSING
+    values: tuple[q.Value, ...] = MISSING
     label: str = MISSING  # what a table calls it
-    refine: Refinement = 1  # cells of the truth's mesh per cell of the estimator's, each way
+    refine: q.Refinement = 1  # cells of the truth's mesh per cell of the estimator's, each way
     source: Literal["structured", "tetwild"] | None = None
-    columns: CellsAround | None = None
-    rows: CellsAlong | None = None
-    layers: Layers | None = None
+    columns: q.CellsAround | None = None
+    rows: q.CellsAlong | None = None
+    layers: q.Layers | None = None
     element: str | None = None
     # Columns and rows of a coarser mesh: both closures are extrapolated to zero mesh size.
-    extrapolated_from: tuple[AxisCount, ...] = ()
-    dt_factor: Annotated[float, within(0.001, 100, "", "one time step over another")] = 1.0
+    extrapolated_from: tuple[q.AxisCount, ...] = ()
+    dt_factor: Annotated[float, q.within(0.001, 100, "", "one time step over another")] = 1.0
     reading: str | None = None  # Poisson option
-    ratio: dict[str, Ratio] = field(default_factory=dict)  # region -> E_f over E_perp
+    ratio: dict[str, q.Ratio] = field(default_factory=dict)  # region -> E_f over E_perp
     fixed: ByParameter = field(default_factory=dict)  # pressure_scale, chord_stiffness, ...
 
 
@@ -145,10 +117,10 @@ class Paper:
     """What the paper reports for the same experiment."""
 
     table: str = MISSING
-    estimate: tuple[Modulus, ...] | None = None
-    error_percent: tuple[Percent, ...] | None = None
-    moduli_error_percent: tuple[Percent, ...] | None = None  # mean and SD over all moduli
-    distance_mm: tuple[Length, ...] | None = None  # mean and SD
+    estimate: tuple[q.Modulus, ...] | None = None
+    error_percent: tuple[q.Percent, ...] | None = None
+    moduli_error_percent: tuple[q.Percent, ...] | None = None  # mean and SD over all moduli
+    distance_mm: tuple[q.Length, ...] | None = None  # mean and SD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,18 +169,18 @@ class Config:
     truth: Truth = field(default_factory=Truth)
     check: Switch = False  # only check the case, or the image step of a volume, and draw it
     continuation: bool = True  # later closures start from the last closed state
-    continuation_reach: Logarithm | None = None  # unless the log of a parameter changes by more
+    continuation_reach: q.Logarithm | None = None  # unless the log of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes
-    seed: Seed = 1
-    repeats: Repeats = 1  # observations with the seeds seed, seed + 1, ..., each estimated from
+    seed: q.Seed = 1
+    repeats: q.Repeats = 1  # observations with the seeds seed, seed + 1, ..., each estimated from
     figures: Switch = True  # draw the run; a sweep need not draw every job
     force: Switch = False  # run finished jobs again
     dry_run: Switch = False  # only list what would run, and how long it would take
     detach: Switch = False  # only plan the jobs of a sweep, for `mvest worker`
     # A job that takes longer is stopped and recorded as failed.
-    time_limit_s: Annotated[TimeLimit | None, NOT_HASHED] = None
+    time_limit_s: Annotated[q.TimeLimit | None, NOT_HASHED] = None
     # A job that needs more fails; null: an equal share of the machine's memory.
-    memory_limit_gb: Annotated[Gigabytes | None, NOT_HASHED] = None
+    memory_limit_gb: Annotated[q.Gigabytes | None, NOT_HASHED] = None
     # The metric that optimising sweepers minimise, by its name in MLflow.
     objective: Annotated[str, NOT_HASHED] = "error.mean"
     # What is varied in this job, by name.
@@ -221,10 +193,7 @@ class Config:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """A configuration, without Hydra's part, as resolved plain data.
-
-    Raises a `ConfigurationError` if an override has deleted a setting.
-    """
+    """Resolved plain data; raises a `ConfigurationError` if a setting was deleted."""
     found: dict[str, Any] = {}
     for key in map(str, config):
         if key != "hydra":
@@ -239,10 +208,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
-    """SHA-256 of everything in a configuration, resolved or not, that can change the result.
-
-    A file or folder counts by its content, not by its name.
-    """
+    """SHA-256 of everything that can change the result; files count by content, not by name."""
     values = plain(config) if isinstance(config, DictConfig) else config
     _require_names(values)  # Hydra is about to make a folder of this name
     return config_hash(with_contents(_kinds(values.get("study")), values, hashed=True))
@@ -260,10 +226,7 @@ def is_hashed(key: str, study: str | None) -> bool:
 
 
 def require_in_range(values: Mapping[str, Any]) -> None:
-    """Refuse resolved plain data with a number outside its range, or an unusable text.
-
-    Raises a `ConfigurationError`: one line with the setting, its value and the range.
-    """
+    """Raise a `ConfigurationError` for a number outside its range, or an unusable text."""
     _require_names(values)
     kinds = _kinds(values.get("study"))
     for name, value in values.items():
@@ -316,7 +279,7 @@ class Studies(dict[str, Any]):
         settings: type = load_study(name).settings
         config = OmegaConf.structured(schema(Config, settings))
         config.study = name
-        return ConfigNode(file, config, GROUP, "_global_", "mvest")
+        return ConfigNode(file, config, "study", "_global_", "mvest")
 
 
 def _chosen(group: str, *, _root_: DictConfig) -> str:
@@ -336,7 +299,7 @@ def register() -> None:
     hash of the case whose anatomy is configured.
     """
     studies = Studies.fromkeys(f"{name}.yaml" for name in study_names())
-    ConfigStore.instance().repo[GROUP] = studies
+    ConfigStore.instance().repo["study"] = studies
     resolvers: dict[str, Callable[..., str | None]] = {
         "package_model": lambda: sha256_of(MODEL_FILE) if MODEL_FILE.is_file() else None,
         "valve_folder": lambda *, _root_: folder_hash(_root_.valve.folder),

@@ -18,17 +18,13 @@ from tqdm import tqdm
 
 from mvest.typing import FloatArray
 
-SILENCE_S = 10.0
-"""Longest time without a sign of life."""
-
-WIDTH = 100
-"""Characters of a line of a terminal."""
+SILENCE_S = 10.0  # longest time without a sign of life
+WIDTH = 100  # characters of a line of a terminal
 
 TYPICAL_SOLVES = 6
 """Forward solves that a filter usually needs; only the first guess of what is left."""
 
-QUICK_S = 1.0
-"""A forward solve that ends sooner than this after the last line gets no line."""
+QUICK_S = 1.0  # a forward solve that ends sooner than this after the last line gets no line
 
 
 def duration(seconds: float) -> str:
@@ -53,24 +49,22 @@ def say(text: str) -> None:
 
 
 class Heartbeat:
-    """Writes what goes on whenever nothing was written for `SILENCE_S`; redraws a visible bar.
-
-    Parameters
-    ----------
-    bar : tqdm
-    status : callable
-        () -> line that says what goes on.
-    """
+    """Writes the status whenever nothing was written for `SILENCE_S`; redraws a visible bar."""
 
     def __init__(self, bar: Any, status: Callable[[], str]) -> None:
         self._bar, self._status, self._ended = bar, status, threading.Event()
-        self.last = time.monotonic()
+        self.last = self.began = time.monotonic()
         threading.Thread(target=self._beat, daemon=True).start()
 
     def say(self, text: str) -> None:
         """Write a line."""
         self.last = time.monotonic()
         say(text)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the beginning."""
+        return time.monotonic() - self.began
 
     def end(self) -> None:
         """Stop, and remove the bar."""
@@ -88,21 +82,10 @@ class Heartbeat:
 class SolveBar:
     """Reports forward solves and steps of a filter; a bar moves with the time steps of a solve.
 
-    How many solves a filter needs is not known beforehand. A typical number is expected, and after
-    that one more at a time.
-
-    Parameters
-    ----------
-    title : str
-    steps : int
-        Time steps of one solve; 0 for a model that reports none, which gets no bar.
-    solves : int
-        Expected number of solves.
-    names : sequence of str, optional
-        Of the parameters, in the order of :meth:`iterate`.
-    whole : float
-        Expected time of everything in units of the first solve, if solves are not most of it; 0: it
-        follows from the expected number of solves.
+    ``steps`` is the number of time steps of one solve; 0 for a model that reports none, which gets
+    no bar. ``solves`` are expected, and after these one more at a time. ``names`` are those of the
+    parameters of :meth:`iterate`. If solves are not most of the work, ``whole`` is the expected
+    time of everything in units of the first solve.
     """
 
     def __init__(
@@ -111,11 +94,11 @@ class SolveBar:
         self._title, self._names, self._expected, self._steps = title, names, solves, steps
         self._solve, self._last, self._made, self._whole = 0, math.inf, 0, whole
         self._spent: list[float] = []
-        self._before: tuple[FloatArray, float] | None = None
-        self._began = self._solve_began = self._now = time.monotonic()
-        hidden = None if steps else True
-        self._bar = tqdm(total=steps, desc=title, unit="step", disable=hidden, leave=False)
+        self._bar = tqdm(
+            total=steps, desc=title, unit="step", disable=None if steps else True, leave=False
+        )
         self._lines = Heartbeat(self._bar, self._status)
+        self._solve_began = self._now = self._lines.began
 
     def __enter__(self) -> SolveBar:
         return self
@@ -140,17 +123,11 @@ class SolveBar:
         """One more iterate of a filter: its number, the parameters (p,) and the objective."""
         self._end_solve()
         self._solve_began = time.monotonic()
-        before = self._before if number else None
-        self._before = m, objective
-        change = "" if before is None else f" ({objective - before[1]:+.2g})"
         names = list(self._names)
         if len(names) != len(m):  # a first stage estimates the moduli alone
             names = [name for name in names if name.startswith("E_f.")]
-        lines = [f"{self._title}, step {number}: objective {objective:.4g}{change}"]
-        for k, (name, value) in enumerate(zip(names, m, strict=False)):
-            moved = "" if before is None else f" ({value - before[0][k]:+.2g})"
-            lines.append(f"{name} {value:.4g}{moved}")
-        self._lines.say(", ".join([*lines, *self._left()]))
+        values = [f"{name} {value:.4g}" for name, value in zip(names, m, strict=False)]
+        self._say(f"step {number}: objective {objective:.4g}", *values)
 
     def _end_solve(self) -> None:
         """Report the forward solve that has ended, if it was not reported yet."""
@@ -159,26 +136,27 @@ class SolveBar:
         spent = self._now - self._solve_began
         self._spent.append(spent)
         if self._now - self._lines.last >= QUICK_S:
-            solve = f"forward solve {self._solve}: {self._made} time steps in {spent:.1f} s"
-            self._lines.say(", ".join([f"{self._title}, {solve}", *self._left()]))
+            self._say(f"forward solve {self._solve}: {self._made} time steps in {spent:.1f} s")
         self._solve_began, self._made, self._last = self._now, 0, math.inf
 
     def _status(self) -> str:
-        """What goes on within a solve."""
-        solve = f"forward solve {max(self._solve, 1)}: {self._made} time steps"
+        """Progress within a solve."""
         of = f" of {self._steps}" if self._steps >= self._made else ""
-        return ", ".join([f"{self._title}, {solve}{of}", *self._left()])
+        solve = f"forward solve {max(self._solve, 1)}: {self._made} time steps{of}"
+        return ", ".join([self._title, solve, *self._left()])
+
+    def _say(self, *parts: str) -> None:
+        self._lines.say(", ".join([self._title, *parts, *self._left()]))
 
     def _left(self) -> list[str]:
-        """The time that has passed, and an estimate of the time left."""
-        elapsed = time.monotonic() - self._began
+        """The elapsed time, and an estimate of the time left."""
+        elapsed = self._lines.elapsed
         text = [f"{duration(elapsed)} elapsed"]
         if self._whole and self._spent:
             left = self._whole * self._spent[0] - elapsed
             return [*text, f"about {duration(left)} left"] if left > 0.1 * elapsed else text
         # The first solve starts from the open valve. Later ones continue it and are quicker.
-        later = self._spent[1:]
-        if not later:
+        if not (later := self._spent[1:]):
             return text
         each = sum(later) / len(later)
         if (more := self._expected - len(self._spent)) > 0:
@@ -189,29 +167,20 @@ class SolveBar:
 class PartBar:
     """A bar over the equal pieces of one part of a study, and a line when the part is done.
 
-    Parameters
-    ----------
-    title : str
-    total : int
-        Number of pieces; 0 if only the first finished piece tells it.
-    unit : str
-    workers : int
-        Number of pieces in work at a time.
-    quiet : bool
-        Write no line at the end.
+    ``total`` is the number of pieces, 0 if it is known only after the first one; ``workers`` pieces
+    are in work at a time. ``quiet`` writes no line at the end.
     """
 
     def __init__(
         self, title: str, total: int, unit: str, workers: int = 1, *, quiet: bool = False
     ) -> None:
         self._title, self._total, self._unit, self._workers = title, total, unit, workers
-        self._quiet = quiet
-        self._done, self._spent = 0, 0.0
-        self._began = self._last = time.monotonic()
+        self._quiet, self._done, self._spent = quiet, 0, 0.0
         # tqdm's own estimate of the time left knows no workers.
         form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
         self._bar = tqdm(total=total, desc=title, disable=None, leave=False, bar_format=form)
         self._lines = Heartbeat(self._bar, self._status)
+        self._last = self._lines.began
 
     def __enter__(self) -> PartBar:
         return self
@@ -219,7 +188,7 @@ class PartBar:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._lines.end()
         if kind is None and not self._quiet:
-            say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")
+            say(f"{self._title}: done in {duration(self._lines.elapsed)}")
 
     def step(self, total: int | None = None, seconds: float | None = None) -> None:
         """One more piece is done, of ``total`` if given; it took ``seconds``, if given."""
@@ -233,15 +202,15 @@ class PartBar:
         self._bar.update(1)
 
     def left(self) -> float:
-        """Seconds until the last piece is done.
+        """Seconds until the last piece is done, from the mean time of the finished pieces.
 
-        Each remaining piece takes the mean time of those done. Pieces in work are half done on
-        average, and at the end workers wait for the last piece, which cancel.
+        Pieces in work are half done on average, and at the end workers wait for the last piece;
+        these two cancel.
         """
         left = self._total - self._done
         return left / max(1, min(self._workers, left)) * self._spent / max(1, self._done)
 
     def _status(self) -> str:
-        count = f"{self._done} of {self._total or '?'} {self._unit}s"
-        parts = [f"{self._title}: {count}", f"{duration(time.monotonic() - self._began)} elapsed"]
-        return ", ".join([*parts, *([f"about {duration(self.left())} left"] if self._done else [])])
+        left = [f"about {duration(self.left())} left"] if self._done else []
+        count = f"{self._title}: {self._done} of {self._total or '?'} {self._unit}s"
+        return ", ".join([count, f"{duration(self._lines.elapsed)} elapsed", *left])

@@ -25,29 +25,20 @@ from mvest.quantities import OutsideError
 from mvest.reading.text import check_words
 
 T = TypeVar("T")
+# Plain data of a configuration, or of a part of it.
 Values: TypeAlias = Mapping[str, Any]
-"""Plain data of a configuration, or of a part of it."""
-
-MAX_LETTERS = 10_000
-"""Longest text of a setting."""
-
-LARGEST = 1e15
-"""Largest number of a setting whose type has no range."""
-
+MAX_LETTERS = 10_000  # longest text of a setting
+LARGEST = 1e15  # largest number of a setting whose type has no range
+# Marks a setting that changes no number of a result; it is left out of the hash.
 NOT_HASHED = "not hashed"
-"""Marks a setting that changes no number of a result; it is left out of the hash."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Reads:
     """Marks a setting that names files or folders which the study reads.
 
-    The hash of a configuration uses their content, not their names.
-
-    Attributes
-    ----------
-    contents : callable
-        (value of the setting, its neighbouring values) -> plain data that identify the content.
+    The hash of a configuration uses their content, not their names: ``contents`` maps the value of
+    the setting and its neighbouring values to plain data that identify the content.
     """
 
     contents: Callable[[Any, Values], Any]
@@ -197,10 +188,7 @@ def defaults_of(cls: type) -> str:
 
 
 def require_admissible_values(kind: Any, value: Any, key: str = "") -> None:
-    """Refuse values of a schema with a number outside its range, or an unusable text.
-
-    Raises an `MvestError` as `validated`.
-    """
+    """Raise an `MvestError` for a number outside its range, or an unusable text."""
     validated(kind, value, key)
     _require_plain(value, key)
 

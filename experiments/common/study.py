@@ -43,18 +43,10 @@ class Job(Generic[S]):
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """The records of all runs of one published table, or of a single run.
+    """The records of all runs of one published table, or of a single run."""
 
-    Attributes
-    ----------
-    records : mapping of str to Record
-        By name; at least one. The record that the table is named after comes first.
-    arrays : mapping of str to Path
-        File of arrays of those records that have one.
-    """
-
-    records: Mapping[str, Record]
-    arrays: Mapping[str, Path] = field(default_factory=dict)
+    records: Mapping[str, Record]  # by name; the record that the table is named after is first
+    arrays: Mapping[str, Path] = field(default_factory=dict)  # files of those that have arrays
 
     @property
     def first(self) -> Record:
@@ -84,52 +76,26 @@ class Results:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study(Generic[S]):
-    """How a kind of study is run and shown.
+    """How a kind of study is run and shown."""
 
-    Attributes
-    ----------
-    settings : type
-        Frozen dataclass: what the study adds to the configuration.
-    run : callable
-        Job -> result.
-    summary : callable or None
-        Results -> tables for readers, by name. Readers then see these instead of the results' own
-        tables, which are still written as CSV.
-    figure : callable or None
-        Results -> figure, or figures by name (``""`` is the main one), or None if there is nothing
-        to draw.
-    captions : mapping
-        Name of a figure -> its caption.
-    latex : tuple of str
-        File names of the paper's own tables and figures, which are also written as LaTeX and PDF.
-    words : callable or None
-        Record -> text for the terminal; by default its tables.
-    files : callable or None
-        (folder, record) -> further files written into the folder of a run, for example a report.
-    keep : callable
-        Record -> the part of it that is published.
-    keep_arrays : callable
-        (record, file of arrays) -> arrays that are published with the record; none by default.
-    keeps_failures : bool
-        Whether failed runs are published, too, because the study counts them.
-    check : callable or None
-        (configuration, output folder) -> text that ``check=true`` prints without estimating.
-    require : callable
-        Configuration -> None; raises `ConfigurationError` for settings that no job could run with.
-    """
-
-    settings: type[S]
+    settings: type[S]  # frozen dataclass: what the study adds to the configuration
     run: Callable[[Job[S]], Result]
+    # Tables for readers, by name. The results' own tables are then written as CSV only.
     summary: Callable[[Results], Mapping[str, Table]] | None = None
+    # A figure, figures by name ("" is the main one), or None if there is nothing to draw.
     figure: Callable[[Results], Figure | Mapping[str, Figure] | None] | None = None
-    captions: Mapping[str, str] = field(default_factory=dict)
-    latex: tuple[str, ...] = ()
-    words: Callable[[Record], str] | None = None
+    captions: Mapping[str, str] = field(default_factory=dict)  # by name of the figure
+    latex: tuple[str, ...] = ()  # names of the paper's own tables and figures: LaTeX and PDF, too
+    words: Callable[[Record], str] | None = None  # text for the terminal; None: the tables
+    # Further files in the folder of a run, for example a report.
     files: Callable[[Path, Record], list[Path]] | None = None
-    keep: Callable[[Record], Record] = lambda record: record
+    keep: Callable[[Record], Record] = lambda record: record  # the part that is published
+    # Arrays that are published with a record, from the file of all its arrays.
     keep_arrays: Callable[[Record, Path], Mapping[str, Any]] = lambda record, path: {}
-    keeps_failures: bool = False
+    keeps_failures: bool = False  # publish failed runs, too, because the study counts them
+    # (configuration, output folder) -> text that ``check=true`` prints without estimating
     check: Callable[[Mapping[str, Any], Path], str] | None = None
+    # Raises a `ConfigurationError` for settings that no job could run with.
     require: Callable[[Mapping[str, Any]], None] = lambda values: None
 
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 TYPES = {"text": "string", "integer": "Int64", "number": "float64", "truth value": "boolean"}
 
+MLFLOW = {"mlartifacts", "mlruns"}  # folders of copies
+
 COLUMNS: dict[str, tuple[str, str, str]] = {
     "record": ("text", "", "file of the run or sweep, from the folder of all of them"),
     "job": ("text", "", "hash of the job within a sweep"),
@@ -80,16 +82,18 @@ def estimate_table(folder: Path) -> DataFrame:
     rows: list[dict[str, Any]] = []
     tables = sorted((folder / RECORDS).glob("*.jsonl"))
     published = sorted((folder / SWEEPS).glob("*.json"))
-    sweeps = published or ([] if tables else _below(folder, "sweep.json"))
-    runs = [] if tables or published else _below(folder, "result.json")
-    # A sweep stands for its jobs.
-    whole: set[Path] = set()
+    sweeps, runs = (
+        [path for path in sorted(folder.rglob(name)) if not MLFLOW & set(path.parts)]
+        for name in ("sweep.json", "result.json")
+    )
+    if tables or published:
+        sweeps, runs = published, []
+    whole: set[Path] = set()  # folders of sweeps, which stand for their jobs
     for path in [*tables, *sweeps, *runs]:
         place = path.relative_to(folder).as_posix()
         try:
             if path in tables:
-                found = records_of(folder, path.stem)
-                for name, record in found.records.items() if found else ():
+                for name, record in records_of(folder, path.stem).records.items():
                     rows += _rows(record, f"{place}#{name}")
             elif path in sweeps:
                 rows += _of_sweep(read_sweep(path), place)
@@ -111,10 +115,8 @@ def sweep_table(sweep: Sweep) -> DataFrame:
 def write_estimates(folder: Path, target: Path) -> list[Path]:
     """Write the table of a folder (``.csv`` or ``.parquet``), and its data dictionary next to it.
 
-    Raises
-    ------
-    InputError
-        As `estimate_table`; or the name ends otherwise, or a file cannot be written.
+    Raises an `InputError` as `estimate_table`; or the name ends otherwise, or a file cannot be
+    written.
     """
     if target.suffix not in (".csv", ".parquet"):
         raise InputError(f"{target}: expected a name that ends with .csv or .parquet")
@@ -126,11 +128,6 @@ def write_estimates(folder: Path, target: Path) -> list[Path]:
         write_atomically(target, content),
         write_atomically(target.with_suffix(".columns.csv"), dictionary),
     ]
-
-
-def _below(folder: Path, name: str) -> list[Path]:
-    copies = {"mlartifacts", "mlruns"}
-    return [path for path in sorted(folder.rglob(name)) if not copies & set(path.parts)]
 
 
 def _of_sweep(sweep: Sweep, place: str | None = None) -> list[dict[str, Any]]:

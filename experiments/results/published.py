@@ -28,8 +28,7 @@ from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
 from mvest.reading.documents import parse_json
 
-RECORDS = "records"
-"""Folder of the records within the results."""
+RECORDS = "records"  # folder of the records within the results
 
 
 def publish_as(
@@ -110,8 +109,7 @@ def publish(
         place.mkdir(parents=True, exist_ok=True)
         # Several processes may publish at the same time.
         with FileLock(results / f".{table}.lock"):
-            known = records_of(results, table)
-            records = {} if known is None else dict(known.records)
+            records = dict(records_of(results, table).records)
             for name, (record, folder) in runs.items():
                 own = arrays_of(folder, name)
                 stored = study.keep_arrays(record, own[name]) if own else {}
@@ -123,7 +121,6 @@ def publish(
                 arrays |= own
             write_records(results, table, records)
             published = records_of(results, table)
-            assert published is not None
             shown = Results(published.records, {**published.arrays, **arrays})
             return write_results(results, study, shown)
     except OSError as error:
@@ -145,33 +142,25 @@ def regenerate(results: Path) -> list[Path]:
     written: list[Path] = []
     for path in paths:
         found = records_of(results, path.stem)
-        assert found is not None
         written += write_results(results, load_study(found.first.study), found)
     for sweep in sweeps:
         written += write_sweep(results, sweep)
     return written
 
 
-def records_of(results: Path, table: str) -> Results | None:
-    """The published records of a table, the one of its name first; None if there is none.
-
-    Raises an `InputError` if one is damaged.
-    """
+def records_of(results: Path, table: str) -> Results:
+    """The published records of a table, if any, the one of its name first; checks them."""
     path = results / RECORDS / f"{table}.jsonl"
-    if not path.is_file():
-        return None
     records = {}
-    for k, line in enumerate(path.read_bytes().splitlines()):
+    for k, line in enumerate(path.read_bytes().splitlines() if path.is_file() else ()):
         data = parse_json(line, f"{path}, line {k + 1}")
         name = str(data.get("name"))
         where = f"{path}, record {name}"
         records[name] = record_from(data.get("record") or {}, where, _arrays(results, table, name))
     order = sorted(records, key=lambda name: (name != table, name))
     arrays = {name: _arrays(results, table, name) for name in order}
-    return Results(
-        {name: records[name] for name in order},
-        {name: place for name, place in arrays.items() if place.is_file()},
-    )
+    own = {name: place for name, place in arrays.items() if place.is_file()}
+    return Results({name: records[name] for name in order}, own)
 
 
 def write_records(results: Path, table: str, records: Mapping[str, Record]) -> Path:

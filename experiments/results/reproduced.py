@@ -10,8 +10,7 @@ from experiments.results.published import records_of
 from mvest.errors import InputError
 from mvest.reporting.markup import number
 
-SAME = 1e-5
-"""Relative difference of estimates between machines and versions of libraries."""
+SAME = 1e-5  # relative difference of estimates between machines and versions of libraries
 
 
 def compared(table: str, own: Path, published: Path) -> str:
@@ -21,16 +20,17 @@ def compared(table: str, own: Path, published: Path) -> str:
     records of the table.
     """
     mine, theirs = records_of(own, table), records_of(published, table)
-    if mine is None or theirs is None:
-        raise InputError(f"{own if mine is None else published}: no records of {table}")
+    for folder, found in ((own, mine), (published, theirs)):
+        if not found.records:
+            raise InputError(f"{folder}: no records of {table}")
     parts, furthest = [], 0.0
     for name, record in mine.records.items():
         for estimate, other in zip(record.estimates, theirs.records[name].estimates, strict=True):
             for one in estimate.unknowns:
-                found, expected = one.estimate, other.unknown(one.name).estimate
-                if found is not None and expected:
-                    furthest = max(furthest, abs(found / expected - 1.0))
-                elif found != expected:
+                value, expected = one.estimate, other.unknown(one.name).estimate
+                if value is not None and expected:
+                    furthest = max(furthest, abs(value / expected - 1.0))
+                elif value != expected:
                     furthest = float("inf")
         values = [number(one.estimate) for one in record.estimates[0].moduli]
         parts.append(f"{record.row} {' and '.join(values)} MPa")

@@ -32,11 +32,10 @@ if TYPE_CHECKING:
 
 Execute = Callable[[Request, int | None, int], Record]
 
+# Dask's cluster of this machine, and where it listens.
 LOCAL, LOOPBACK = "LocalCluster", "127.0.0.1"
-"""Dask's cluster of this machine, and where it listens."""
-
+# Seconds for a scheduler to answer, and for the first worker on this machine to start.
 CONNECT_S, START_S = 15, 60
-"""Seconds for a scheduler to answer, and for the first worker on this machine to start."""
 
 DASK = {
     # Jobs take minutes: none is queued at a busy worker.

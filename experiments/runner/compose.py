@@ -17,7 +17,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.override_parser.types import OverrideType
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from experiments.common.config import hash_of, plain
@@ -34,12 +34,8 @@ def expand(config: DictConfig, arguments: Sequence[str], loader: ConfigLoader) -
     ``config`` is the sweep's own configuration with Hydra's part, ``arguments`` are those of the
     command line.
 
-    Raises
-    ------
-    ConfigurationError
-        If the sweep has no such size, no grid, or no job.
-    HydraException
-        If a line is not in Hydra's syntax, or varies a setting continuously.
+    Raises a `ConfigurationError` if the sweep has no such size, no grid, or no job, and a
+    `HydraException` if a line is not in Hydra's syntax, or varies a setting continuously.
     """
     parser = OverridesParser.create(config_loader=loader)
     found: list[list[str]] = []
@@ -86,7 +82,10 @@ def make_plan(
             settings = [
                 one
                 for one in parsed.values()
-                if _sets_value(one) and not is_group(one.key_or_group)
+                if one.type == OverrideType.CHANGE
+                and one.package is None
+                and not isinstance(one.value(), dict)
+                and not is_group(one.key_or_group)
             ]
             kind = tuple(
                 str(one.key_or_group if one in settings else one.input_line)
@@ -104,7 +103,14 @@ def make_plan(
             if values["time_limit_s"] is None and "time_limit_s" not in parsed:
                 values["time_limit_s"] = TIME_LIMIT_S
             values["factors"] = {
-                **{key: _factor(one) for key, one in parsed.items() if key in varied},
+                **{
+                    # A number, or the text that was typed.
+                    key: v
+                    if isinstance(v := one.value(), int | float)
+                    else one.get_value_element_as_str()
+                    for key, one in parsed.items()
+                    if key in varied
+                },
                 **values["factors"],
             }
             # Equal parts are shared, so that many configurations fit into memory.
@@ -148,12 +154,6 @@ def _grids(config: DictConfig) -> list[dict[str, Any]]:
     return listed
 
 
-def _sets_value(override: Override) -> bool:
-    """Whether an override sets a single value and merges nothing."""
-    changes = override.type == OverrideType.CHANGE and override.package is None
-    return changes and not isinstance(override.value(), dict)
-
-
 def _varied(
     config: DictConfig, typed: list[str], jobs: Sequence[Sequence[str]], parser: OverridesParser
 ) -> set[str]:
@@ -168,9 +168,3 @@ def _varied(
     found |= {one.get_key_element() for one in swept if one.is_sweep_override()}
     own = {key for grid in _grids(config) for key in grid} if config.sweep else set()
     return found - own
-
-
-def _factor(override: Override) -> Any:
-    """The value of an override as a factor: a number, or the text that was typed."""
-    value = override.value()
-    return value if isinstance(value, int | float) else override.get_value_element_as_str()

@@ -27,11 +27,8 @@ from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.processes import Program, ending, environment, python
 from mvest.provenance import THREAD_VARIABLES
 
-WORKER = python("experiments.runner.job")
-"""Command of a process that runs jobs."""
-
-LEAVE_S = 2.0
-"""Time in which a worker without a job exits by itself."""
+WORKER = python("experiments.runner.job")  # command of a process that runs jobs
+LEAVE_S = 2.0  # time in which a worker without a job exits by itself
 
 
 class StoppedError(Exception):
@@ -129,12 +126,8 @@ def run_jobs(
     Closing the iterator early, as an interrupt does, ends the running jobs without a record.
     ``at_a_time`` jobs share one machine and its memory; for ``requested_ns`` see `usable_record`.
 
-    Raises
-    ------
-    ConfigurationError
-        If the cluster does not exist or cannot be reached.
-    OSError
-        If dask's scheduler is lost.
+    Raises a `ConfigurationError` if the cluster cannot be reached, and an `OSError` if dask's
+    scheduler is lost.
     """
     if settings.elsewhere:
         yield from run_on_dask(execute, stop_jobs, requests, settings, requested_ns)
@@ -163,10 +156,7 @@ _busy: set[WorkerProcess] = set()
 def run_apart(
     request: Request, requested_ns: int | None = None, at_a_time: int = 1, *, aloud: bool = False
 ) -> Record:
-    """Run a job as `attempt` does, in a worker process.
-
-    ``at_a_time`` jobs share the memory of this machine; for ``aloud`` see `WorkerProcess.run`.
-    """
+    """Run a job as `attempt` does, in a worker process (see `WorkerProcess.run`)."""
     idle = _idle.setdefault(str(Path.cwd()), [])
     try:
         worker = idle.pop()

@@ -26,43 +26,26 @@ from experiments.common.progress import wrapped
 from experiments.common.records.record import Record
 from experiments.common.records.writer import words_of, write_results
 from experiments.common.schema import build
-from experiments.common.study import Job, Results, Study, load_study, study_names
+from experiments.common.study import Job, Results, load_study, study_names
 from experiments.console import raised
 from experiments.results.published import arrays_of
+from experiments.runner import jobs
 from experiments.runner.engine import run_apart
-from experiments.runner.jobs import (
-    LOG,
-    UNWRITTEN,
-    Request,
-    attempt,
-    default_memory_gb,
-    held_memory,
-    last_record,
-    mark_done,
-    replace_record,
-    usable_record,
-    write_hydra,
-)
+from experiments.runner.jobs import Request
 from experiments.runner.tracking import require_no_password
 from mvest.errors import ConfigurationError, InputError, MvestError, message_of
 from mvest.reading.text import one_line
 
 
 def require_admissible(values: Mapping[str, Any]) -> None:
-    """Refuse settings that no job could run with.
-
-    Raises an `MvestError` if a setting is inadmissible; the message names it.
-    """
+    """Raise an `MvestError` that names a setting that no job could run with."""
     require_no_password(values["tracking"]["uri"])
     mechanics_of(values)
     load_study(values["study"]).require(values)
 
 
 def check_of(values: Mapping[str, Any]) -> Callable[[Mapping[str, Any], Path], str]:
-    """The check of a study, for ``check=true``.
-
-    Raises a `ConfigurationError` if studies of this kind have none.
-    """
+    """The check of a study; raises a `ConfigurationError` if it has none."""
     check = load_study(values["study"]).check
     if check is None:
         kinds = ", ".join(name for name in study_names() if load_study(name).check)
@@ -81,7 +64,7 @@ def run_job(request: Request) -> Record:
     Raises an `MvestError` if a setting is inadmissible or a file cannot be written.
     """
     values, folder = request.values, request.folder
-    record = usable_record(request)
+    record = jobs.usable_record(request)
     if record is not None:
         source = record.provenance
         _show(record, folder)
@@ -91,8 +74,8 @@ def run_job(request: Request) -> Record:
         )
         return record
     if values["time_limit_s"] is None:
-        memory_gb = values["memory_limit_gb"] or default_memory_gb()
-        return attempt(request, partial(compute, request, memory_gb))
+        memory_gb = values["memory_limit_gb"] or jobs.default_memory_gb()
+        return jobs.attempt(request, partial(compute, request, memory_gb))
     # Only another process can be stopped at any moment.
     record = run_apart(request, aloud=True)
     if record.converged:
@@ -106,19 +89,23 @@ def compute(request: Request, memory_gb: float) -> None:
     If a file after the record cannot be written, the next run of the job writes it and computes
     nothing again.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible or a file cannot be written.
-    MemoryError
-        If it needs more memory; the message states the limit.
+    Raises an `MvestError` if a setting is inadmissible or a file cannot be written, and a
+    `MemoryError` that states the limit if it needs more memory.
     """
     folder, values = request.folder, request.values
-    with held_memory(memory_gb):
-        write_hydra(request)
+    with jobs.held_memory(memory_gb):
+        jobs.write_hydra(request)
         study = load_study(values["study"])
-        record = last_record(folder, request.config_hash, cut_off=True)
-        record = record or _computed(study, request)
+        record = jobs.last_record(folder, request.config_hash, cut_off=True)
+        if record is None:
+            started = time.time()
+            settings = build(study.settings, values)
+            result = study.run(Job(values, settings, folder, request.config_hash))
+            if hash_of(values) != request.config_hash:
+                # It is unknown which content was read.
+                reason = "a file or folder that the settings name was changed before the job ended"
+                result = result.changed(status="failed", reason=reason)
+            record = jobs.replace_record(request, result, started)
         try:
             if values["figures"]:
                 name = record.experiment
@@ -127,25 +114,14 @@ def compute(request: Request, memory_gb: float) -> None:
                     study.files(folder, record)
             _show(record, folder)
             if record.converged:
-                mark_done(folder)
+                jobs.mark_done(folder)
         except MemoryError:
             raise
         except Exception as error:
             # Whatever a library for figures or texts raises, the numbers are on disk.
             raise InputError(
-                f"{one_line(message_of(error))}; {UNWRITTEN.format(folder)}"
+                f"{one_line(message_of(error))}; {jobs.UNWRITTEN.format(folder)}"
             ) from error
-
-
-def _computed(study: Study[Any], request: Request) -> Record:
-    started = time.time()
-    settings = build(study.settings, request.values)
-    result = study.run(Job(request.values, settings, request.folder, request.config_hash))
-    if hash_of(request.values) != request.config_hash:
-        # It is unknown which content was read.
-        reason = "a file or folder that the settings name was changed before the job ended"
-        result = result.changed(status="failed", reason=reason)
-    return replace_record(request, result, started)
 
 
 def _show(record: Record, folder: Path) -> None:
@@ -170,8 +146,8 @@ def main() -> None:
     with suppress(KeyboardInterrupt), raised():
         for line in requests:
             order = json.loads(line)
-            request = Request.from_json(order)
-            with (request.folder / LOG).open("wb") as log:
+            request = build(Request, order)
+            with (request.folder / jobs.LOG).open("wb") as log:
                 for stream in (1,) if order["aloud"] else (1, 2):
                     os.dup2(log.fileno(), stream)
             answered = answer(request, order["memory_gb"])
@@ -187,10 +163,7 @@ def main() -> None:
 
 
 def answer(request: Request, memory_gb: float) -> dict[str, Any]:
-    """Run a job; the ``reason`` is None if it wrote its record.
-
-    ``refused`` means that the request is wrong, and that this process may run another one.
-    """
+    """Run a job: the ``reason`` if it wrote no record, and whether the request is ``refused``."""
     try:
         compute(request, memory_gb)
     except Exception as error:

@@ -12,7 +12,7 @@ import resource
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -29,60 +29,34 @@ from mvest.files import remove_parts, require_writable, sha256_of, write_atomica
 from mvest.provenance import write_json
 
 DONE, RESULT, CONFIG, LOG, LOCK = "done", "result.json", "config.json", "log.txt", ".lock"
+# Files of a job: marker, record, configuration, output, lock, and folder of Hydra's settings.
 HYDRA = ".hydra"
-"""Files of a job: marker, record, configuration, output, lock, and folder of Hydra's settings."""
-
+# Message for a job whose record is on disk while another file could not be written.
 UNWRITTEN = f"the estimate is in {{}}/{RESULT}, and the same command writes what is missing"
-"""Message for a job whose record is on disk while another file could not be written."""
-
-HASH_DIGITS = 16
-"""Digits of its hash by which a job is named."""
-
+HASH_DIGITS = 16  # digits of its hash by which a job is named
+# s, default for jobs of sweeps: 50 times the longest of those in ``results/`` (269 s).
 TIME_LIMIT_S = 14_400.0
-"""s, default for jobs of sweeps: 50 times the longest of those in ``results/`` (269 s)."""
-
+# Share of the machine's memory that all jobs get; and bytes, as Slurm counts them.
 SHARE, GB = 0.8, 2**30
-"""Share of the machine's memory that all jobs get; and bytes, as Slurm counts them."""
 
 PROCESS, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One resolved configuration and its output folder.
-
-    Attributes
-    ----------
-    config_hash : str
-        SHA-256 of everything in the configuration that can change the result.
-    publish_as : str or None
-        Name of its record in the results; None: do not publish it.
-    overrides : tuple of str
-        The request in Hydra's syntax.
-
-    Raises
-    ------
-    ConfigurationError
-        If a setting is outside its range.
-    """
+    """One configuration in its ranges (or a `ConfigurationError`), and its output folder."""
 
     values: dict[str, Any]
-    config_hash: str
+    config_hash: str  # SHA-256 of everything in the configuration that can change the result
     folder: Path
-    publish_as: str | None = None
-    overrides: tuple[str, ...] = ()
+    publish_as: str | None = None  # name of its record in the results; None: do not publish it
+    overrides: tuple[str, ...] = ()  # the request in Hydra's syntax
 
     def __post_init__(self) -> None:
         require_in_range(self.values)
 
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Request:
-        """The request that :meth:`to_json` wrote; other entries are ignored."""
-        own = {field.name: data[field.name] for field in fields(cls)}
-        return cls(**{**own, "folder": Path(data["folder"]), "overrides": tuple(data["overrides"])})
-
     def to_json(self) -> dict[str, Any]:
-        """Plain data."""
+        """Plain data, from which `experiments.common.schema.build` makes the request again."""
         data = {field.name: getattr(self, field.name) for field in fields(self)}
         return {**data, "folder": str(self.folder)}
 
@@ -103,7 +77,7 @@ class FailedRunError(Exception):
 
 
 def is_done(folder: Path) -> bool:
-    """Whether everything that belongs to the present record is on disk."""
+    """Whether the record and all files that follow from it are on disk."""
     try:
         return (folder / DONE).read_text(encoding="ascii") == sha256_of(folder / RESULT)
     except (OSError, ValueError):
@@ -111,15 +85,15 @@ def is_done(folder: Path) -> bool:
 
 
 def mark_done(folder: Path) -> None:
-    """Write the marker: everything that belongs to the present record is on disk."""
+    """Write the marker: the record and all files that follow from it are on disk."""
     write_atomically(folder / DONE, sha256_of(folder / RESULT))
 
 
 def last_record(folder: Path, config_hash: str, *, cut_off: bool = False) -> Record | None:
     """The record of the last attempt; None if there is none of this version and configuration.
 
-    It is a failure, or a success that is done. With ``cut_off`` it is a success that is not done:
-    a file that follows from it could not be written.
+    It is a failure, or a success that is done; with ``cut_off`` it is a success that is not done,
+    because a file that follows from it could not be written.
     """
     try:
         record = read_record(folder / RESULT)
@@ -168,10 +142,7 @@ def attempt(
 
 
 def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
-    """Lock the folder until the context or this process ends; prints a note if it has to wait.
-
-    Raises an `InputError` if the folder cannot be locked.
-    """
+    """Lock a folder, or raise an `InputError`; prints a note if it has to wait."""
     held = FileLock(folder / LOCK)
     try:
         try:
@@ -184,20 +155,12 @@ def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
 
 
 def make_way(request: Request) -> None:
-    """Remove what an unfinished attempt left, except a record whose outputs are missing.
-
-    A finished record stays until its replacement is complete. A note reports a changed record.
-    """
+    """Remove what an unfinished attempt left, except a record whose outputs are missing."""
     folder = request.folder
     adopt_arrays(folder / RESULT)
     remove_parts(folder)
     if is_done(folder):
         return
-    if (folder / DONE).exists():
-        try:
-            read_record(folder / RESULT)
-        except InputError as error:
-            print(f"note: {error}; it is computed again", file=sys.stderr)
     if request.values["force"] or not last_record(folder, request.config_hash, cut_off=True):
         for name in (DONE, RESULT):
             (folder / name).unlink(missing_ok=True)
@@ -208,10 +171,8 @@ def replace_record(request: Request, result: Result, started: float) -> Record:
 
     The job ``started`` so many seconds after the epoch.
 
-    Raises
-    ------
-    InputError
-        If they cannot be written; the former record and arrays are then still there.
+    Raises an `InputError` if they cannot be written; the former record and arrays are then still
+    there.
     """
     folder = request.folder
     record = stamp(request.values, request.config_hash, result, started)
@@ -222,10 +183,7 @@ def replace_record(request: Request, result: Result, started: float) -> Record:
 
 
 def write_failure(request: Request, reason: str, started: float) -> Record:
-    """Record why a job has no estimate, as `replace_record` does.
-
-    If it had already computed its estimate, that record stays, and a warning says so.
-    """
+    """Record why a job has no estimate; an estimate that was computed stays, with a warning."""
     computed = last_record(request.folder, request.config_hash, cut_off=True)
     if computed is not None:
         remedy = UNWRITTEN.format(request.folder)
@@ -241,10 +199,7 @@ def failed_record(request: Request, reason: str) -> Record:
 
 
 def write_hydra(request: Request) -> None:
-    """Write the resolved configuration and the overrides where Hydra's users expect them.
-
-    Raises an `InputError` if they cannot be written.
-    """
+    """Write configuration and overrides where users of Hydra expect them."""
     place = request.folder / HYDRA
     place.mkdir(exist_ok=True)
     for name, data in (("config", request.values), ("overrides", list(request.overrides))):
@@ -254,10 +209,7 @@ def write_hydra(request: Request) -> None:
 
 @contextmanager
 def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
-    """Remove a job's folder, and its parents within the outputs, if nothing was written there.
-
-    Hydra makes the folder before the request is checked.
-    """
+    """Remove a job's folder, which Hydra made, and its parents, if nothing was written there."""
     try:
         yield
     finally:

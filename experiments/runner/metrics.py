@@ -18,8 +18,7 @@ ALWAYS = (
 )  # fmt: skip
 """Settings that every run shows, overridden or not."""
 
-LARGEST_ERROR = 1.0
-"""Relative error of a modulus beyond which an estimate is implausible."""
+LARGEST_ERROR = 1.0  # relative error of a modulus beyond which an estimate is implausible
 
 
 def metrics(record: Record) -> dict[str, float]:
@@ -58,8 +57,7 @@ def metrics(record: Record) -> dict[str, float]:
 def implausible(record: Record) -> str:
     """Why a run is left out of comparisons; empty if it is plausible.
 
-    It failed, its verdict is that there is no estimate, or the relative error of a modulus exceeds
-    `LARGEST_ERROR`.
+    It failed, its verdict is that there is no estimate, or the error exceeds `LARGEST_ERROR`.
     """
     if not record.converged:
         return "failed"

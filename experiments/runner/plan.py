@@ -17,6 +17,7 @@ from typing import Any
 
 from experiments.common.progress import duration
 from experiments.common.records.record import Record, here_and_now
+from experiments.common.schema import build
 from experiments.runner.jobs import Request, failed_record, last_record
 from experiments.sweeps.collected import Sweep, SweptJob, head_of
 from mvest.errors import ConfigurationError, InputError
@@ -24,14 +25,10 @@ from mvest.provenance import config_hash, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line
 
-PLAN = "plan.json"
-"""File in a sweep's folder that lists its jobs."""
-
+PLAN = "plan.json"  # file in a sweep's folder that lists its jobs
+# Settings that differ between jobs, or that belong to a machine or the runner.
 NOT_COMMON = ("factors", "paths", "tracking", "sweep")
-"""Settings that differ between jobs, or that belong to a machine or the runner."""
-
-NOT_RUN = "not run"
-"""Reason of a job that never began or was interrupted."""
+NOT_RUN = "not run"  # reason of a job that never began or was interrupted
 
 
 def earlier(jobs: Iterable[Request]) -> dict[str, Record]:
@@ -42,36 +39,18 @@ def earlier(jobs: Iterable[Request]) -> dict[str, Record]:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """All jobs of a sweep, in order.
-
-    Attributes
-    ----------
-    name : str
-        Of the configuration.
-    folder : Path
-        Of the sweep.
-    sweep : dict
-        The configuration's ``sweep``, empty for jobs swept on the command line.
-    jobs : tuple of Request
-    before : mapping
-        Records of earlier attempts, see `earlier`.
-    workers : int
-        Jobs that run at a time; 1 if unknown.
-    publish : bool or None
-        Whether the sweep is copied to the results; False: it would be, but for its overrides; None:
-        it is not to be published.
-    written_ns : int or None
-        When the plan was written; None: it was not.
-    """
+    """All jobs of a sweep, in order."""
 
     name: str
     folder: Path
-    sweep: dict[str, Any]
+    sweep: dict[str, Any]  # of the configuration; empty for jobs swept on the command line
     jobs: tuple[Request, ...]
-    before: Mapping[str, Record] = field(default_factory=dict)
-    workers: int = 1
+    before: Mapping[str, Record] = field(default_factory=dict)  # earlier attempts, see `earlier`
+    workers: int = 1  # jobs that run at a time
+    # Whether to copy the sweep to the results; False: not because of overrides; None: no sweep to
+    # be published.
     publish: bool | None = None
-    written_ns: int | None = None
+    written_ns: int | None = None  # time of `write`
 
     @property
     def common(self) -> dict[str, Any]:
@@ -79,24 +58,13 @@ class Plan:
         return self.jobs[0].values
 
     @property
-    def done(self) -> dict[str, Record]:
-        """The earlier attempts with a result."""
-        return {key: record for key, record in self.before.items() if record.converged}
-
-    @property
     def to_run(self) -> list[Request]:
         """Jobs that are missing, have failed, or are to be run again."""
-        done = self.done
+        done = {key for key, record in self.before.items() if record.converged}
         return [job for job in self.jobs if job.values["force"] or job.config_hash not in done]
 
     def require_different(self) -> None:
-        """Refuse a plan with the same job twice, or with two jobs in one folder.
-
-        Raises
-        ------
-        ConfigurationError
-            The message names both.
-        """
+        """Raise a `ConfigurationError` that names two equal jobs, or two with one folder."""
         first: dict[Path, Request] = {}
         for job in self.jobs:
             other = first.setdefault(job.folder.resolve(), job)
@@ -108,10 +76,7 @@ class Plan:
                 )
 
     def write(self) -> Plan:
-        """Write ``plan.json`` into the sweep's folder; returns the plan with `written_ns`.
-
-        The first configuration is written whole, of the others only the differences.
-        """
+        """Write ``plan.json``, of later jobs only the differences to the first one."""
         self.folder.mkdir(parents=True, exist_ok=True)
         place, created = self.folder / PLAN, time.gmtime()
         jobs = [
@@ -155,10 +120,8 @@ class Plan:
 
         Changes to the directory in which the sweep was planned.
 
-        Raises
-        ------
-        InputError
-            If there is none, or it was written by another version or on another machine.
+        Raises an `InputError` if there is none, or it was written by another version or on another
+        machine.
         """
         place = folder.resolve() / PLAN
         if not place.is_file():
@@ -173,7 +136,7 @@ class Plan:
             for job in data["jobs"]:
                 shared = {k: v for k, v in common.items() if k not in job["without"]}
                 own = {"values": shared | job["values"], "folder": place.parent / job["folder"]}
-                requests.append(Request.from_json({**job, **own}))
+                requests.append(build(Request, {**job, **own}))
             return cls(
                 data["name"],
                 place.parent,
@@ -191,18 +154,17 @@ class Plan:
 
     def summary(self) -> str:
         """How many jobs are done and left, and how long they will take, in one line."""
-        left, done = len(self.to_run), self.done
-        failed, size = len(self.before) - len(done), self.sweep.get("size")
+        left, size = len(self.to_run), self.sweep.get("size")
+        done = [record.seconds_total for record in self.before.values() if record.converged]
         takes = "nothing left"
         if left and done:
-            mean = fmean(record.seconds_total for record in done.values())
-            total = duration(mean * left / min(self.workers, left))
+            total = duration(fmean(done) * left / min(self.workers, left))
             takes = f"about {total}, {self.workers} at a time"
         elif left:
             takes = "time unknown: no job has finished yet"
         return (
             f"{self.name}{f' ({size})' if size else ''}: {len(self.jobs)} jobs, {len(done)} done, "
-            f"{failed} failed before, {left} to run; {takes}"
+            f"{len(self.before) - len(done)} failed before, {left} to run; {takes}"
         )
 
     def listing(self) -> str:
@@ -216,10 +178,7 @@ class Plan:
         return "\n".join(lines)
 
     def collect(self, ended: Mapping[str, Record]) -> Sweep:
-        """The results of all jobs, in their order; failed and missing jobs are included.
-
-        ``ended`` maps hashes of configurations to heads of records of jobs that have just run.
-        """
+        """All results in order, failed and missing ones too; ``ended`` has heads of new records."""
         known, first = {**self.before, **ended}, self.common
         sources = [
             known[one.config_hash].provenance for one in self.jobs if one.config_hash in known

@@ -30,11 +30,8 @@ class FailedSweepError(Exception):
 class GridSweeper(Sweeper):
     """Passes all jobs of a grid, or of a union of grids, to the launcher at once.
 
-    Parameters
-    ----------
-    params : mapping or sequence of mapping, optional
-        A grid (setting -> choices in Hydra's syntax) or a list of grids. They are read from the
-        configuration, where a sweep's own size replaces them.
+    ``params``, a grid (setting -> choices in Hydra's syntax) or a list of grids, is read from the
+    configuration, where a sweep's own size replaces it.
     """
 
     def __init__(self, params: object = None) -> None:
@@ -50,14 +47,10 @@ class GridSweeper(Sweeper):
         self._parts = hydra_context, config, launcher
 
     def sweep(self, arguments: list[str]) -> Sequence[JobReturn]:
-        """Expand and launch the jobs.
+        """Expand and launch the jobs; raises a `FailedSweepError` if one has no estimate.
 
-        Raises
-        ------
-        FailedSweepError
-            If a job has no estimate.
-        MvestError, HydraException, OmegaConfBaseException
-            If the request is wrong.
+        Raises an `MvestError`, `HydraException` or `OmegaConfBaseException` if the request is
+        wrong.
         """
         from experiments.runner.compose import expand
 
@@ -73,12 +66,8 @@ class GridSweeper(Sweeper):
 class JobLauncher(Launcher):
     """Plans and checks jobs, runs those that are not done, and collects and logs all of them.
 
-    Each job runs in a separate process and returns its objective.
-
-    Parameters
-    ----------
-    **settings
-        Those of `experiments.runner.cluster.EngineSettings`, read from the configuration.
+    Each job runs in a separate process and returns its objective. The settings are those of
+    `experiments.runner.cluster.EngineSettings`, read from the configuration.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -96,10 +85,8 @@ class JobLauncher(Launcher):
     ) -> Sequence[JobReturn]:
         """Run jobs.
 
-        Raises
-        ------
-        MvestError, HydraException, OmegaConfBaseException
-            If the request is wrong; then nothing is run.
+        Raises an `MvestError`, `HydraException` or `OmegaConfBaseException` if the request is
+        wrong; then nothing is run.
         """
         # Its import takes seconds, which `--help` must not.
         from experiments.runner.sweep import launch

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from experiments.results.estimates import sweep_table
 from experiments.results.published import publish_runs, publish_sweep
 from experiments.runner.cluster import EngineSettings, require_engine
 from experiments.runner.compose import make_plan
-from experiments.runner.engine import run_jobs
+from experiments.runner.engine import execute, run_jobs
 from experiments.runner.job import check_of, require_admissible
 from experiments.runner.jobs import FailedRunError, Request, last_record, nothing_empty
 from experiments.runner.metrics import metrics
@@ -30,14 +31,11 @@ from experiments.sweeps.report import text_of, write_sweep
 from mvest.errors import ConfigurationError, MvestError
 from mvest.files import require_writable, write_atomically
 
+# Files in a sweep's folder: its configuration as Hydra writes it, and a table of all jobs.
 MULTIRUN, TABLE = "multirun.yaml", "jobs.parquet"
-"""Files in a sweep's folder: its configuration as Hydra writes it, and a table of all jobs."""
-
-PLANNED = "planned"
-"""The sweeper that knows the grids of ``sweep=NAME``."""
-
+PLANNED = "planned"  # the sweeper that knows the grids of ``sweep=NAME``
+# Sweepers that know all their jobs beforehand; others may try a job twice.
 GIVEN_ONCE = (PLANNED, "basic")
-"""Sweepers that know all their jobs beforehand; others may try a job twice."""
 
 
 def launch(
@@ -49,29 +47,12 @@ def launch(
 ) -> tuple[list[JobReturn], tuple[Request, ...]]:
     """Compose the jobs of a batch, refuse a wrong one before anything is written, and run them.
 
-    Parameters
-    ----------
-    config : DictConfig
-        The sweep's own configuration, with Hydra's part.
-    loader : ConfigLoader
-    overrides : sequence of sequence of str
-        Those of each job.
-    first : int
-        Number of the first of them in the sweep.
-    before : sequence of Request
-        Jobs of earlier batches of the same sweep.
+    ``config`` is the sweep's own configuration with Hydra's part, ``overrides`` are those of each
+    job, ``first`` is the number of the first one in the sweep, and ``before`` are the jobs of
+    earlier batches. Returns the result of each job with its objective, none if jobs were only
+    planned or checked, and all jobs of the sweep so far.
 
-    Returns
-    -------
-    list of JobReturn
-        One for each job, with its objective; empty if jobs were only planned or checked.
-    tuple of Request
-        All jobs of the sweep so far.
-
-    Raises
-    ------
-    MvestError, HydraException, OmegaConfBaseException
-        If the request is wrong.
+    Raises an `MvestError`, `HydraException` or `OmegaConfBaseException` if the request is wrong.
     """
     launcher: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
     launcher.pop("_target_")
@@ -117,7 +98,16 @@ def launch(
         return [], jobs
     ended = _run(plan, batch, settings)
     found = {job.hash: job.record for job in finish(plan, ended).jobs}
-    returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
+    returned = []
+    for job in batch.jobs:
+        record, one = found[job.short_hash], JobReturn(job.overrides, working_dir=str(job.folder))
+        one.status = JobStatus.COMPLETED if record.converged else JobStatus.FAILED
+        one.return_value = (
+            metrics(record).get(config.objective, math.nan)
+            if record.converged
+            else FailedRunError(f"{record.reason} (recorded in {job.folder})")
+        )
+        returned.append(one)
     folder, common = plan.folder, plan.common
     del ended, found, plan, batch  # frees ten thousand records before they are logged
     log_run(folder, common)
@@ -154,10 +144,27 @@ def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]
     return ended
 
 
-def collect_sweep(folder: Path) -> int:
-    """Collect and log the results of a sweep that workers run, also before its end.
+def run_shard(folder: Path, shard: str) -> int:
+    """Run every N-th job of a planned sweep from the I-th on, for a ``shard`` "I/N".
 
-    Returns the exit status: 1 if a job has no estimate.
+    A failing job is recorded and does not fail the shard, so the exit status is 0.
+
+    Raises an `MvestError` if nothing is planned in the folder, or there is no such shard.
+    """
+    found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", shard)
+    first, step = map(int, found.groups()) if found else (0, 0)
+    if not 1 <= first <= step:
+        raise ConfigurationError(f"shard {shard}, expected I/N with I from 1 to N, for example 2/8")
+    plan = Plan.read(folder, look=False)
+    # Counted over all jobs, done or not, so that no two shards share one.
+    jobs = plan.jobs[first - 1 :: step]
+    failed = sum(not execute(job, plan.written_ns).converged for job in jobs)
+    print(f"shard {shard}: {len(jobs)} jobs, {failed} without an estimate")
+    return 0
+
+
+def collect_sweep(folder: Path) -> int:
+    """Collect and log a sweep that workers run, also before its end; 1 if a job has no estimate.
 
     Raises an `MvestError` if nothing is planned in the folder, or the results cannot be written.
     """
@@ -168,10 +175,7 @@ def collect_sweep(folder: Path) -> int:
 
 
 def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
-    """Write, show and publish the results of a sweep.
-
-    Raises an `MvestError` if the results cannot be written.
-    """
+    """Write, show and publish the results of a sweep; raises an `MvestError` if it cannot."""
     found = collected(plan, ended)
     print(text_of(found))
     for path in write_sweep(plan.folder, found):
@@ -212,15 +216,3 @@ def collected(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
     )
     print(f"Written to {path}")
     return found
-
-
-def _returned(job: Request, record: Record, objective: str) -> JobReturn:
-    """The result of a job for Hydra."""
-    returned = JobReturn(overrides=job.overrides, working_dir=str(job.folder))
-    returned.status = JobStatus.COMPLETED if record.converged else JobStatus.FAILED
-    returned.return_value = (
-        metrics(record).get(objective, math.nan)
-        if record.converged
-        else FailedRunError(f"{record.reason} (recorded in {job.folder})")
-    )
-    return returned

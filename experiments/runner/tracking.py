@@ -16,12 +16,13 @@ import subprocess
 import sys
 import time
 import urllib.request
+import webbrowser
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
 
 from filelock import FileLock
@@ -29,6 +30,7 @@ from omegaconf import OmegaConf
 
 from experiments.common.progress import PartBar, say
 from experiments.common.records.record import read_record
+from experiments.common.schema import validated
 from experiments.runner.jobs import CONFIG, RESULT, is_done
 from experiments.runner.metrics import Values, implausible, metrics, settings_of
 from experiments.runner.plan import PLAN
@@ -36,19 +38,16 @@ from experiments.sweeps.collected import read_sweep
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.files import sha256_of
 from mvest.processes import Program, environment, python
+from mvest.quantities import within
 from mvest.reading.documents import read_mapping
 
+# Files: the results of a sweep; the overrides of a run.
 SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
-"""Files: the results of a sweep; the overrides of a run."""
-
+# Files that MLflow keeps a copy of.
 FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
-"""Files that MLflow keeps a copy of."""
-
-MANY = 1000
-"""A sweep with more jobs is one run of MLflow, without runs for its jobs."""
-
+MANY = 1000  # a sweep with more jobs is one run of MLflow, without runs for its jobs
+# Tags: the sweep's run of a job; the hash of the result, set when a run is logged completely.
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
-"""Tags: the sweep's run of a job; the hash of the result, set when a run is logged completely."""
 
 MANNERS = {
     # Give up on an unreachable server after seconds, not minutes.
@@ -59,15 +58,11 @@ MANNERS = {
 }
 """Default settings of MLflow; its server inherits them."""
 
+# Folder of MLflow's copies in the outputs; beginning of a local database's address.
 ARTIFACTS, SQLITE = "mlartifacts", "sqlite:///"
-"""Folder of MLflow's copies in the outputs; beginning of a local database's address."""
-
-PASSWORD = re.compile(r"://[^/@:]*:[^/@]+@")
+# Messages of SQLite and MLflow about a file that is no database, damaged, or incomplete.
 BROKEN = re.compile(r"malformed|not a database|no such (table|column)|out-of-date database schema")
-"""Messages of SQLite and MLflow about a file that is no database, damaged, or incomplete."""
-
-MOST = 100
-"""Largest number of runs on MLflow's page of comparison, which reads them one by one."""
+MOST = 100  # largest number of runs on MLflow's page of comparison, which reads them one by one
 
 SERVED = MANNERS | {
     "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
@@ -87,7 +82,7 @@ class TrackingError(MvestError):
 
 def require_no_password(uri: str | None) -> None:
     """Raise a `ConfigurationError` for an address with a password."""
-    if uri is not None and PASSWORD.search(uri):
+    if uri is not None and re.search(r"://[^/@:]*:[^/@]+@", uri):
         raise ConfigurationError(
             "tracking.uri holds a password, which would be written into every config.json; leave "
             "it out and put it in ~/.pgpass or MLFLOW_TRACKING_PASSWORD"
@@ -98,10 +93,8 @@ def require_no_password(uri: str | None) -> None:
 def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
     """Point MLflow at a store and an experiment, which are made if missing; yields the address.
 
-    Raises
-    ------
-    TrackingError
-        If the store cannot be opened, or a write in the context fails: one line that names it.
+    Raises a `TrackingError` if the store cannot be opened, or a write in the context fails: one
+    line that names it.
     """
     require_no_password(uri)
     outputs = outputs.resolve()
@@ -142,10 +135,7 @@ def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
 
 
 def log_run(folder: Path, config: Values) -> None:
-    """Log a single run or a sweep, with the configuration of its first job.
-
-    A failing store costs a line of warning; every result is on disk.
-    """
+    """Log a run or a sweep; if the store fails, print a warning: every result is on disk."""
     outputs = Path(config["paths"]["outputs"])
     try:
         if (folder / RESULT).is_file() or (folder / PLAN).is_file():
@@ -157,6 +147,8 @@ def log_run(folder: Path, config: Values) -> None:
 
 def sync(outputs: Path) -> int:
     """Log everything in a folder of outputs that its store lacks; 1 if a file was unreadable."""
+    if not outputs.is_dir():
+        raise InputError(f"{outputs}: there is no such folder")
     counts, swept = Counter[str](), set[Path]()
     for path in [*sorted(outputs.rglob(PLAN)), *sorted(outputs.rglob(RESULT))]:
         try:
@@ -165,25 +157,21 @@ def sync(outputs: Path) -> int:
                 swept |= {path.parent / job["folder"] for job in read.get("jobs", ())}
                 counts += _log(path.parent, outputs, read.get("values", read))
         except (MvestError, OSError, KeyError) as error:
-            counts["left"] += _left_out(path, error)
+            say(f"warning: {path} left out: {error}")
+            counts["left"] += 1
     print(f"{outputs}: {counts['added']} runs added to MLflow, {counts['there']} were there")
     return int(counts["left"] > 0)
 
 
-def _left_out(path: Path, error: Exception) -> int:
-    say(f"warning: {path} left out: {error}")
-    return 1
-
-
 class Entry(NamedTuple):
-    """A run for MLflow; its first tag identifies it, ``seconds`` is the time of its computation."""
+    """A run for MLflow."""
 
     result: Path
     name: str
-    tags: Values
+    tags: Values  # the first one identifies the run
     settings: Values
     numbers: dict[str, float]
-    seconds: float
+    seconds: float  # of its computation
 
 
 def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
@@ -192,7 +180,8 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     if not tracking["enabled"]:
         return counts
     plan: Any = read_mapping(folder / PLAN) if (folder / PLAN).is_file() else None
-    jobs: Any = plan["jobs"] if plan else [{"folder": "", "overrides": _typed(folder)}]
+    typed = list(map(str, OmegaConf.load(folder / TYPED))) if (folder / TYPED).is_file() else []
+    jobs: Any = plan["jobs"] if plan else [{"folder": "", "overrides": typed}]
     shown = jobs if len(jobs) <= MANY else []
     with (
         PartBar(f"{name}, to MLflow", len(shown), "run", quiet=True) as bar,
@@ -210,14 +199,9 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
                 if (place / RESULT).is_file() and (entry := _job(place, job)):
                     counts[_put(entry, known, parent)[1]] += 1
             except (MvestError, KeyError) as error:
-                counts["left"] += _left_out(place, error)
+                say(f"warning: {place} left out: {error}")
+                counts["left"] += 1
     return counts
-
-
-def _typed(folder: Path) -> list[str]:
-    """The overrides of a single run."""
-    place = folder / TYPED
-    return list(map(str, OmegaConf.load(place))) if place.is_file() else []
 
 
 def _job(folder: Path, job: Values) -> Entry | None:
@@ -293,6 +277,19 @@ def runs_of(experiment: str, chosen: str) -> list[Any]:
     from mlflow import search_runs
 
     return list(search_runs(None, chosen, experiment_names=[experiment], output_format="list"))
+
+
+def dashboard(outputs: Path, port: int) -> int:
+    """Show the last sweep in MLflow's pages until interrupted; port 0 is any free one."""
+    validated(Annotated[int, within(0, 65_535, "", "ports; 0: a free one")], port, "--port")
+    try:
+        place, page, title = last_sweep(outputs)
+        with serving(place, port) as (address, server):
+            print(f"{title}: {address}{page}", flush=True)
+            webbrowser.open(address + page)
+            return server.wait()
+    except KeyboardInterrupt:
+        return 0
 
 
 def last_sweep(outputs: Path) -> tuple[str, str, str]:

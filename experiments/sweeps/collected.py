@@ -16,8 +16,7 @@ from mvest.problem.registration import unit_of
 from mvest.provenance import require_sealed, sealed
 from mvest.reading.documents import read_mapping, validated
 
-SWEEPS = "sweeps"
-"""Folder of the published sweeps within the results."""
+SWEEPS = "sweeps"  # folder of the published sweeps within the results
 
 NOT_KEPT: dict[str, Any] = {
     "detail": "", "frames": (), "condition_number": None, "distance_to_truth_mm": None,
@@ -26,22 +25,12 @@ NOT_KEPT: dict[str, Any] = {
 
 
 class SweptJob(Frozen):
-    """One job of a sweep.
+    """One job of a sweep, with the seeds ``seed``, ..., ``seed + repeats - 1``."""
 
-    Attributes
-    ----------
-    hash : str
-        First digits of the hash of its configuration.
-    seed, repeats : int
-        Its seeds are ``seed``, ..., ``seed + repeats - 1``.
-    record : Record
-        Its head, see `head_of`.
-    """
-
-    hash: str
+    hash: str  # first digits of the hash of its configuration
     seed: int
     repeats: int = 1
-    record: Record
+    record: Record  # its head, see `head_of`
 
     @property
     def runs(self) -> tuple[EstimateRecord, ...]:
@@ -57,33 +46,17 @@ class SweptJob(Frozen):
 
 
 class Sweep(Frozen):
-    """Jobs that differ in their factors.
+    """Jobs that differ in their factors."""
 
-    Attributes
-    ----------
-    version : int
-        Of this layout.
-    paper : mapping or None
-        The paper's results: ``table``, ``estimate``, ``error_percent``.
-    provenance : Provenance
-        Of the process that collected the jobs; its configuration hash is that of all jobs.
-    commits : tuple of str
-        Those that computed the jobs.
-    settings : mapping
-        The configuration of the first job, without factors and what belongs to a machine.
-    jobs : tuple of SweptJob
-        At least one.
-    """
-
-    version: Literal[4] = 4
+    version: Literal[4] = 4  # of this layout
     name: str
     size: str | None = None
     title: str
     parameters: tuple[str, ...]
-    paper: Mapping[str, Any] | None = None
-    provenance: Provenance
-    commits: tuple[str, ...] = ()
-    settings: Mapping[str, Any] = {}
+    paper: Mapping[str, Any] | None = None  # its ``table``, ``estimate`` and ``error_percent``
+    provenance: Provenance  # of the process that collected the jobs, with the hash of all jobs
+    commits: tuple[str, ...] = ()  # those that computed the jobs
+    settings: Mapping[str, Any] = {}  # of the first job, without factors and paths
     jobs: tuple[SweptJob, ...] = Field(min_length=1)
 
     @property
@@ -109,10 +82,7 @@ def head_of(record: Record) -> Record:
 
 
 def write_sweep_file(path: Path, sweep: Sweep) -> None:
-    """Write a collected sweep with a digest of its content, atomically.
-
-    Raises an `InputError` if it cannot be written.
-    """
+    """Write a sweep with a digest of its content; raises an `InputError` if it cannot."""
     jobs = [job.model_dump(mode="json", exclude_defaults=True) for job in sweep.jobs]
     content = sealed({**sweep.model_dump(mode="json", exclude={"jobs"}), "jobs": jobs})
     text = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
@@ -120,10 +90,7 @@ def write_sweep_file(path: Path, sweep: Sweep) -> None:
 
 
 def read_sweep(path: Path) -> Sweep:
-    """The collected sweep in a file.
-
-    Raises an `InputError` if it cannot be read, is no sweep of this version, or was changed.
-    """
+    """The sweep in a file; raises an `InputError` if it is none or was changed."""
     data = read_mapping(path)
     sweep = validated(Sweep, {k: v for k, v in data.items() if k != "sha256"}, str(path))
     require_sealed(data, str(path))

@@ -30,23 +30,17 @@ from mvest.typing import FloatArray
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-SPAN = 10.0
-"""Ratio of values from which an axis is logarithmic."""
-
+SPAN = 10.0  # ratio of values from which an axis is logarithmic
+# Most values of a factor that get a panel each, and most cells of panels in one row.
 MOST_PANELS, MOST_CELLS = 4, 16
-"""Most values of a factor that get a panel each, and most cells of panels in one row."""
-
+# Most tick labels, characters of a label that is not rotated, and of a line of a label.
 TICKS, SHORT, LINE = 8, 8, 18
-"""Most tick labels, characters of a label that is not rotated, and of a line of a label."""
 
 Values = dict[str, list[Any]]
 
 
 def figures_of(sweep: Sweep) -> dict[str, Figure]:
-    """The figures of a sweep by the end of their file names, if there are data.
-
-    ``""`` shows errors and intervals along each factor, ``matrix`` errors over two factors.
-    """
+    """Errors along each factor (``""``) and over two factors (``matrix``), if there are data."""
     runs = runs_of(sweep).frame
     values = values_of(sweep, runs)
     if good_of(runs)["signed error"].isna().all():
@@ -150,7 +144,10 @@ def _matrix(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
     up, across = max(combinations(values, 2), key=lambda pair: runs[[*pair]].value_counts().size)
     if len(values[across]) < len(values[up]) or not is_number(values[across]):
         up, across = across, up
-    part, parts = _parted(values, (up, across))
+    # A panel for each value of a third factor with few values, names before numbers.
+    few = [one for one in values if one not in (up, across) and len(values[one]) <= MOST_PANELS]
+    part = min(few, key=lambda name: is_number(values[name]), default="")
+    parts = values.get(part, [None])
     pair, maps = [up, across], []
     for value in parts:
         group = runs[runs[part] == value] if part else runs
@@ -188,13 +185,6 @@ def _matrix(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
     pooled = f", over all values of {', '.join(others)}" if others else ""
     note = f"Root mean square error [%] of the worst parameter{pooled}. ×: all runs failed."
     return _titled(figure, sweep, note)
-
-
-def _parted(values: Values, but: Sequence[str]) -> tuple[str, list[Any]]:
-    """The factor with a panel for each value, names before numbers, and its values; or "", None."""
-    few = [name for name in values if name not in but and len(values[name]) <= MOST_PANELS]
-    chosen = min(few, key=lambda name: is_number(values[name]), default="")
-    return chosen, values.get(chosen, [None])
 
 
 def _heading(sweep: Sweep, column: str) -> str:

@@ -28,26 +28,18 @@ if TYPE_CHECKING:
 
 CONVERGED = "converged"
 
-SEED = "seed"
-"""A factor of this name is a repetition and no setting."""
-
+SEED = "seed"  # a factor of this name is a repetition and no setting
+# With more settings of a single run each, different numbers count as repetitions.
 MOST_SETTINGS = 150
-"""With more settings of a single run each, different numbers count as repetitions."""
-
-Z95 = 1.959963984540054
-"""97.5 % quantile of the normal distribution."""
-
+Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution
+# Endings of factor names that state a unit.
 ENDINGS = {"mm": "mm", "mpa": "MPa", "mmhg": "mmHg", "s": "s", "percent": "%"}
-"""Endings of factor names that state a unit."""
-
+# Filter coordinates are MPa, or logarithms where the filter works in them.
 COVARIANCE = "filter coordinates²"
-"""Filter coordinates are MPa, or logarithms where the filter works in them."""
-
+# A unit that may differ from row to row, and two columns.
 UNIT, BOUND, ERROR = "unit of the parameter", "Cramér–Rao bound", "signed error"
-"""A unit that may differ from row to row, and two columns."""
-
+# Units of factors without such an ending.
 COVARIANCES = {"P0": COVARIANCE, "Q": COVARIANCE, "R": "mm²"}
-"""Units of factors without such an ending."""
 
 COLUMNS = {
     **dict.fromkeys(("job", "seed", "status", "parameter"), ""), "true value": UNIT, "start": UNIT,
@@ -73,11 +65,14 @@ STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
     "std": (Column(UNIT, label="SD stated by the filter"), lambda good: good["std"].mean()),
     "error": (Column("%", label="mean error", hidden=True), lambda good: good[ERROR].mean()),
     "median error": (Column("%"), lambda good: good[ERROR].median()),
-    "RMSE": (Column("%"), lambda good: _rms(good[ERROR])),
+    "RMSE": (Column("%"), lambda good: np.sqrt((good[ERROR] ** 2).mean())),
     "largest error": (Column("%"), lambda good: good[ERROR].abs().max()),
     "RMSE / bound": (
         Column(),
-        lambda good: _rms(good["estimate"] - good["true value"]) / (good[BOUND].mean() or np.nan),
+        lambda good: (
+            np.sqrt(((good["estimate"] - good["true value"]) ** 2).mean())
+            / (good[BOUND].mean() or np.nan)
+        ),
     ),
     "coverage": (
         Column("%", ".0f", low="coverage, low", high="coverage, high",
@@ -94,10 +89,7 @@ STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
 }  # fmt: skip
 """Column -> its meaning, and its value for the converged runs of a setting."""
 
-CAPTIONS = {
-    "": "Errors and intervals along each factor.",
-    "matrix": "Errors over two factors.",
-}
+CAPTIONS = {"": "Errors and intervals along each factor.", "matrix": "Errors over two factors."}
 """End of the file name of a figure -> its caption."""
 
 
@@ -255,10 +247,6 @@ def _statistics(runs: DataFrame) -> dict[str, Any]:
         **{name: number(good) for name, (_, number) in STATISTICS.items()},
         "failures": "; ".join(f"{n} x {text}" if n > 1 else text for text, n in reasons.items()),
     }
-
-
-def _rms(values: Series[Any]) -> float:
-    return float(np.sqrt((values**2).mean()))
 
 
 def _coverage(good: DataFrame) -> tuple[float | None, float | None, float | None]:

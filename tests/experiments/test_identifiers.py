@@ -19,7 +19,7 @@ from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality
 from mvest.provenance import write_json
 from tests.exchange import volume_variants
-from tests.experiments.common.test_inputs import own_program, own_volume, typed
+from tests.experiments.common.test_inputs import own_program, typed
 from tests.experiments.configured import composed, plain
 from tests.made_up_closure import made_up_case, use
 
@@ -117,18 +117,3 @@ def test_no_name_of_a_folder_is_in_the_report_of_a_case(tmp_path: Path, monkeypa
     assert "report.html" in names
     assert leaks(out) == []
     assert "DOE_JANE" in json.dumps(values)
-
-
-def test_what_a_configuration_says_of_files_is_their_content(tmp_path: Path) -> None:
-    place = tmp_path / "DOE_JANE"
-    place.mkdir()
-    words = own_volume(place)
-    assert "DOE_JANE" in words[1]
-    values = {
-        "study": "volume", "volume": words[1].partition("=")[2], "paths": {"outputs": str(place)},
-        "imaged": {"name": "valve 7", "pressure_curve": words[2].partition("=")[2]},
-    }  # fmt: skip
-    kept = without_places(values)
-    assert "DOE_JANE" not in json.dumps(kept)
-    assert "sha256" in json.dumps(kept["volume"])
-    assert kept["imaged"]["name"] == "valve 7"

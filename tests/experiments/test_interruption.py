@@ -60,21 +60,6 @@ def test_a_signal_that_python_drops_comes_again(drop, number, capsys):
     assert "Exception ignored" not in capsys.readouterr().err
 
 
-def test_another_dropped_exception_is_said_as_ever(monkeypatch):
-    said = []
-    monkeypatch.setattr("sys.unraisablehook", said.append)
-
-    def fails(_: object) -> None:
-        raise ValueError
-
-    with raised():
-        referent = Referent()
-        kept = weakref.ref(referent, fails)
-        del referent
-    assert [type(lost.exc_value) for lost in said] == [ValueError]
-    assert kept() is None
-
-
 def test_one_that_is_not_dropped_is_raised_once():
     @raised()
     def stopped() -> None:

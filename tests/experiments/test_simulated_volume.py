@@ -1,20 +1,16 @@
 """The volume to try, and the command that makes such volumes."""
 
 import json
-import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from experiments import cli
-from experiments.common.schema import from_words
-from experiments.simulated_volume import SimulatedVolumeOptions
 from mvest.exchange.surfaces import read_surface
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import default_model
-from mvest.imaging.simulator.acquisition import Acquisition
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TRUTH = EXAMPLES / "volume_truth"
@@ -31,15 +27,6 @@ def test_the_valve_in_the_sample_is_where_the_truth_beside_it_says():
         true = read_surface(TRUTH / f"valve_{frame:04d}.vtp").vertices
         gap = np.linalg.norm(valve.vertices[frame][:, None] - true[None, ::4], axis=2)
         assert gap.min(axis=0).mean() < 2.0
-
-
-def test_the_command_beside_the_sample_is_one_that_is_understood():
-    words = shlex.split(json.loads((TRUTH / "truth.json").read_text())["command"])
-    assert words[:4] == ["mvest", "simulate", "volume", "volume.seq.nrrd"]
-    options = from_words("simulate", SimulatedVolumeOptions, words[4:])
-    shape = read_volume(EXAMPLES / "volume.seq.nrrd").frames.shape
-    assert (options.frames, *options.acquisition.shape) == shape
-    assert isinstance(options.acquisition, Acquisition)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from mvest.errors import GeometryError, InputError
+from mvest.files import write_atomically
 from mvest.reading.documents import parse_json, read_mapping, read_yaml
 from mvest.reading.text import (
     MAX_LINE,

@@ -28,11 +28,10 @@ if TYPE_CHECKING:
 
 Anatomy: TypeAlias = "Template | GivenValve"
 
+# Cells around and along the leaflets of the coarsest mesh on which a closure is followed.
 COARSEST = (24, 3)
-"""Cells around and along the leaflets of the coarsest mesh on which a closure is followed."""
-
+# Vertices of the surface that an unstructured mesh fills, whatever is observed.
 UNSTRUCTURED_SURFACE = (112, 29)
-"""Vertices of the surface that an unstructured mesh fills, whatever is observed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +56,7 @@ def folder_hash(folder: str | None) -> str | None:
 
 
 def anatomy_of(config: Values) -> Anatomy:
-    """The configured anatomy.
-
-    Raises an `MvestError` if a setting is inadmissible, or the case is faulty.
-    """
+    """The configured anatomy; raises an `MvestError` if it is inadmissible."""
     given = config["valve"]
     if given.get("folder") is None:
         return template_of(config)
@@ -76,10 +72,7 @@ def anatomy_of(config: Values) -> Anatomy:
 
 
 def template_of(config: Values) -> Template:
-    """The configured template.
-
-    Raises a `ConfigurationError` if the anatomy is that of a case folder.
-    """
+    """The template; raises a `ConfigurationError` if the anatomy is that of a folder."""
     if config["valve"].get("folder") is not None:
         raise ConfigurationError(
             f"{config['name']} varies the template's parameters, which the anatomy of a folder has "

@@ -42,10 +42,7 @@ def build_filter(
 
 
 def filter_of(method: Values) -> Filter:
-    """The filter that ``_target_`` names, with its settings.
-
-    Raises a `ConfigurationError` if there is no such filter, or it has no such setting.
-    """
+    """The filter that ``_target_`` names; raises a `ConfigurationError` if there is none."""
     target, settings = method.get("_target_"), {k: v for k, v in method.items() if k != "_target_"}
     module, _, name = str(target).rpartition(".")
     kind: Any = None

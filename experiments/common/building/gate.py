@@ -32,24 +32,15 @@ from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.solid_mesh import embed
 
 COLUMNS = {
-    "time": "s:.2f",
-    "pressure": "mmHg:.0f",
-    "orifice": "mm²:.1f",
-    "coaptation": "mm:.1f",
-    "intersections": "",
-    "chord strain": ":.3f",
-    "chord force": "N:.2f",
-    "smallest det F": ":.2f",
+    "time": "s:.2f", "pressure": "mmHg:.0f", "orifice": "mm²:.1f", "coaptation": "mm:.1f",
+    "intersections": "", "chord strain": ":.3f", "chord force": "N:.2f", "smallest det F": ":.2f",
     "Newton iterations": "",
-}
+}  # fmt: skip
 """Columns of `mvest.scenarios.measures.measure_steps`, with units and digits."""
 
 
 def gate_report(values: Values) -> GateReport:
-    """Close the configured anatomy with its true moduli, under variations that must not matter.
-
-    Each result is printed to standard error at once.
-    """
+    """Close the configured anatomy with its true moduli, under variations; prints each result."""
     return run_gate(
         lambda case: closure_model(values, case),
         np.array(values["truth"]["values"], dtype=float),
@@ -97,10 +88,7 @@ def anatomy_digest(values: Mapping[str, Any]) -> str:
 
 
 def gate_of(values: Mapping[str, Any], records: Path = GATE_RECORDS) -> str:
-    """The verdict on the configured anatomy, with its mesh; `NOT_GATED` if there is none.
-
-    ``records`` is the file of published records of the gate, one a line.
-    """
+    """The published verdict on the configured anatomy, with its mesh, or `NOT_GATED`."""
     return _verdicts(records).get(anatomy_digest(values), NOT_GATED)
 
 
@@ -122,20 +110,11 @@ def _verdicts(records: Path) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closing:
-    """A closure from the open valve.
-
-    Attributes
-    ----------
-    model : ClosureModel
-    result : ClosureResult
-        With a frame for each step.
-    normals : (n, 3)
-        Directions of the thickness at the observed vertices.
-    """
+    """A closure from the open valve."""
 
     model: ClosureModel
-    result: ClosureResult
-    normals: FloatArray
+    result: ClosureResult  # with a frame for each step
+    normals: FloatArray  # (n, 3), directions of the thickness at the observed vertices
 
     @property
     def contact_distance_mm(self) -> float:
@@ -201,20 +180,11 @@ def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
 def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequence[str]) -> None:
     """Draw some steps of a closure from the atrium and from the posterior side.
 
-    Parameters
-    ----------
-    part : Figure or SubFigure
-    path : Path
-        An ``.npz`` file with `Closing.arrays`.
-    steps : mapping of int to str
-        Number of a step -> its title. The open orifice of the last one is painted.
-    names : sequence of str
-        Of the leaflets.
+    ``part`` is a figure or part of one, ``path`` an ``.npz`` file with `Closing.arrays`. ``steps``
+    maps numbers of steps to titles; the open orifice of the last one is painted. ``names`` are
+    those of the leaflets.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
+    Raises an `InputError` if the file cannot be read.
     """
     from mvest.problem.fields import case_fields
     from mvest.reporting.case import drawing

@@ -26,22 +26,18 @@ from mvest.simulation.virtual_patient import (
 from mvest.typing import FloatArray
 
 HIDDEN, POSITIONS = "hidden.json", "positions.npz"
-MAX_DRAWS = 5
-"""Anatomies that are drawn, one after another, until one closes."""
+MAX_DRAWS = 5  # anatomies that are drawn, one after another, until one closes
 
 
 @dataclass(frozen=True, slots=True)
 class PatientPlace:
-    """Folders of a virtual patient: the case, which an estimator gets, and the sealed truth."""
+    """Folders of a virtual patient."""
 
-    case: Path
-    hidden: Path
+    case: Path  # for the estimator
+    hidden: Path  # the sealed truth
 
     def truth(self) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-        """The truth, and frame -> ``(n, 3)`` mm, the true positions of its vertices.
-
-        Raises an `InputError` if it is not there.
-        """
+        """The truth, and frame -> true positions ``(n, 3)`` mm; an `InputError` if missing."""
         try:
             return read_mapping(self.hidden / HIDDEN), read_npz(self.hidden / POSITIONS)
         except InputError as error:

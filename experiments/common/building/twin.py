@@ -141,37 +141,20 @@ def observation_errors(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Twin:
-    """A synthetic study.
-
-    Attributes
-    ----------
-    problem : Problem
-        The estimation problem, which knows nothing of the truth.
-    model, truth_model : ClosureModel
-        The estimator's, and a separate one that makes the observation.
-    source : StoredModel or Extrapolated
-        ``truth_model`` with its cache, extrapolated to zero mesh size if requested.
-    truth_values : (p,)
-    valve : Valve
-        The observed surface.
-    observe : callable
-        (model, values= ``(p,)``, rng=) -> an observation of what the model predicts there.
-    """
+    """A synthetic study; its estimation problem knows nothing of the truth."""
 
     problem: Problem
-    model: ClosureModel
-    truth_model: ClosureModel
-    source: StoredModel | Extrapolated
-    truth_values: FloatArray
-    valve: Valve
+    model: ClosureModel  # the estimator's
+    truth_model: ClosureModel  # a separate one, which makes the observation
+    source: StoredModel | Extrapolated  # ``truth_model`` with its cache, extrapolated if requested
+    truth_values: FloatArray  # (p,)
+    valve: Valve  # the observed surface
+    # (model, values= (p,), rng=) -> an observation of what the model predicts there
     observe: Callable[..., TwinData]
 
 
 def build_twin(config: Values) -> Twin:
-    """A synthetic study from its configuration.
-
-    Raises an `MvestError` if a setting is inadmissible; the message names it.
-    """
+    """A synthetic study; raises an `MvestError` that names an inadmissible setting."""
     parameters, truth = tuple(config["parameters"]), config["truth"]
     settings, R = mechanics_of(config), config["filter"]["R"]
     # Cheap checks come before anything is meshed.
@@ -228,10 +211,7 @@ def build_twin(config: Values) -> Twin:
 
 
 def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[StudyResult]:
-    """One estimate for each seed of the errors; they share the truth and the first closure.
-
-    ``name`` is shown with the progress.
-    """
+    """One estimate for each seed; they share truth and first closure; ``name`` is displayed."""
     of_name = f", {name}" if name else ""
     steps = len(twin.truth_model.settings.protocol.steps())
     with SolveBar(f"observation{of_name}", steps, 1) as bar:

@@ -1,9 +1,8 @@
 """Estimates a case in a process that cannot open what the case hides.
 
-The truth of a virtual patient lies in a separate folder. This process runs one estimation, is given
-only the folder of the case, and refuses to open, list or rename anything within the sealed folder.
-Python's audit hooks cannot be removed once they are set (PEP 578). They see what Python opens, not
-what a compiled library or a child program opens by itself.
+The truth of a virtual patient lies in a separate folder. This process gets only the folder of the
+case, and refuses to open, list or rename anything within the sealed folder. Python's audit hooks
+cannot be removed (PEP 578). They do not see what compiled libraries or child programs open.
 """
 
 from __future__ import annotations
@@ -37,14 +36,12 @@ from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
 
+# Files that the process writes into the output folder.
 ESTIMATE, ARRAYS = "estimate.json", "estimate.npz"
-"""Files that the process writes into the output folder."""
-
+# Bytes that the process may allocate. A leaflet that crumples can take all memory there is.
 MAX_MEMORY = 10 * 2**30
-"""Bytes that the process may allocate. A leaflet that crumples can take all memory there is."""
-
+# Parts of a configuration that describe the patient; the estimator does not get them.
 SECRET = ("patient", "echo", "truth", "valve", "seed", "parameters", "row", "factors")
-"""Parts of a configuration that describe the patient; the estimator does not get them."""
 
 
 def seal(folder: Path) -> None:
@@ -69,25 +66,14 @@ def seal(folder: Path) -> None:
 def estimate_blindly(
     values: Mapping[str, Any], folder: Path, case: Path, sealed: Path, gate: str = NOT_GATED
 ) -> Result:
-    """Personalise a case, or the valve in a volume, in a separate process.
+    """Personalise a ``case``, a folder or the file of a volume over time, in a separate process.
 
-    Parameters
-    ----------
-    values : mapping
-        The configuration; the parts that describe the patient are left out.
-    folder : Path
-        Output folder of the job, which exists.
-    case : Path
-        Folder of the case, or the file of a volume over time.
-    sealed : Path
-        Folder that the process cannot open.
-    gate : str
-        Verdict of the gate on the anatomy.
+    The process cannot open the folder ``sealed``, and gets no part of the configuration that
+    describes the patient. It writes into the job's output ``folder``, which exists. ``gate`` is the
+    verdict of the gate on the anatomy.
 
-    Raises
-    ------
-    InputError
-        If the process left no result; the message ends with its last line of output.
+    Raises an `InputError` if the process left no result; the message ends with its last line of
+    output.
     """
     given = {"volume": str(case)} if case.is_file() else {"case": str(case)}
     request = {
@@ -115,10 +101,7 @@ def estimate_blindly(
 
 
 def read_estimate(folder: Path) -> Result:
-    """The result that the process wrote into the output folder.
-
-    Raises an `InputError` if there is none.
-    """
+    """The result in the output folder; raises an `InputError` if there is none."""
     left, arrays = read_mapping(folder / ESTIMATE), folder / ARRAYS
     return Result(**left, arrays=read_npz(arrays) if arrays.is_file() else {})
 

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from experiments.common.building.closure import mechanics_of, mesh_store
 from experiments.common.progress import PartBar, SolveBar, say
-from experiments.common.records.record import (
-    FIELDS,
-    NOT_GATED,
-    Mesh,
-    Model,
-    Record,
-    has_passed,
-)
+from experiments.common.records.record import FIELDS, NOT_GATED, Mesh, Model, Record, has_passed
 from experiments.common.schema import InputFile, Reads, Values, build, contents
 from experiments.common.study import Result
 from mvest.cases.case import Role, ValveCase
@@ -39,30 +32,23 @@ from mvest.personalisation.design import expect_case
 from mvest.personalisation.model import build_coarse, gate_case, gate_lines, with_pressures
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Expected
-from mvest.personalisation.settings import (
-    CaseChoices,
-    PersonaliseSettings,
-    Prior,
-    with_stiffening,
-)
+from mvest.personalisation.settings import CaseChoices, PersonaliseSettings, Prior, with_stiffening
 from mvest.problem.record import Row
 from mvest.problem.registration import REGISTRATION
 from mvest.quantities import Value
 from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
 
-WHOLE = 50.0
-"""Time of a personalisation in units of its first closure; the example case took 52."""
+WHOLE = 50.0  # time of a personalisation in units of its first closure; the example case took 52
 
 
-def _content_of(files_of: Callable[[Path], Any]) -> Reads:
-    """Marks a setting whose files ``files_of`` lists."""
-    return Reads(lambda value, _: contents(files_of(Path(value))) or value)
-
-
-CaseInput = Annotated[str | None, _content_of(files_of_case)]
+CaseInput = Annotated[
+    str | None, Reads(lambda value, _: contents(files_of_case(Path(value))) or value)
+]
 """Type of a setting that names the folder of a case."""
 
-VolumeInput = Annotated[str | None, _content_of(files_of_volume)]
+VolumeInput = Annotated[
+    str | None, Reads(lambda value, _: contents(files_of_volume(Path(value))) or value)
+]
 """Type of a setting that names the file of a volume over time."""
 
 
@@ -157,11 +143,7 @@ def run_case(
 
 
 def run_volume(
-    values: Values,
-    file: str | None,
-    imaged: ImagedInput,
-    personal: PersonalSettings,
-    folder: Path,
+    values: Values, file: str | None, imaged: ImagedInput, personal: PersonalSettings, folder: Path
 ) -> Result:
     """Find the valve in the configured volume, write it, and personalise the case it makes."""
     from mvest.reporting.images import write_image_step
@@ -176,13 +158,7 @@ def run_volume(
 def find_valve(
     file: str | None, imaged: ImagedInput, folder: Path, *, estimate: bool = True
 ) -> DetectedValve:
-    """The valve in the configured volume. A rejected candidate is drawn.
-
-    Raises
-    ------
-    MvestError
-        As `detect_in_volume`, and if no file is configured.
-    """
+    """The valve in a volume; a rejected candidate is drawn, and a `NoValveError` raised."""
     if file is None:
         raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")
     with PartBar("valve in the frames", 0, "frame") as bar:

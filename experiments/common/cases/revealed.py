@@ -27,11 +27,10 @@ from mvest.reporting.tables import Column, Table, table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# An estimate, and the verdict that counts for it.
 Judged: TypeAlias = tuple[EstimateRecord, str]
-"""An estimate, and the verdict that counts for it."""
-
+# Estimates by the name of their scenario, data or filter.
 Groups: TypeAlias = Mapping[str, Sequence[Judged]]
-"""Estimates by the name of their scenario, data or filter."""
 
 NOTHING = dict.fromkeys(("estimate", "std", "low", "high"))
 
@@ -39,10 +38,7 @@ NOTHING = dict.fromkeys(("estimate", "std", "low", "high"))
 def estimate_hidden(
     values: Mapping[str, Any], folder: Path, case: Path, sealed: Path, personal: PersonalSettings
 ) -> Result:
-    """Estimate a case or volume in a process that cannot see its truth.
-
-    If that process fails, the result has failed and has the priors of the moduli.
-    """
+    """Estimate in a process that cannot see the truth; a failure has the priors of the moduli."""
     try:
         return blind.estimate_blindly(values, folder, case, sealed)
     except InputError as fault:

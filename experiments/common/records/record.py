@@ -25,50 +25,37 @@ from mvest.reporting.tables import Table
 if TYPE_CHECKING:
     from mvest.valve.mesh.solid_mesh import SolidMesh
 
-VERSION = 3
-"""Of the layout of a record."""
-
-FIELDS = "fields.npz"
-"""File of a run's arrays, next to its record."""
-
-HASH_DIGITS = 12
-"""Digits of a hash that a line of text shows."""
-
+VERSION = 3  # of the layout of a record
+FIELDS = "fields.npz"  # file of a run's arrays, next to its record
+HASH_DIGITS = 12  # digits of a hash that a line of text shows
+# A verdict of the gate on an anatomy begins with one of these.
 NOT_GATED, PASSED_GATE, FAILED_GATE = "not gated", "passed", "NOT passed"
-"""A verdict of the gate on an anatomy begins with one of these."""
 
 Status = Literal["converged", "failed"]
 Number: TypeAlias = float | int | str | bool | None
 
 
 class GitState(Frozen):
-    """The commit that computed a record, and whether tracked files differed from it.
-
-    Both are None outside a checkout.
-    """
+    """The commit of a record, and whether tracked files differed; None outside a checkout."""
 
     sha: str | None
     dirty: bool | None
 
 
 class Provenance(Frozen):
-    """Where a record came from.
-
-    ``threads`` maps environment variables that cap threads to their values. Hashes are SHA-256; the
-    mesh's is "none" without a mesh. ``finished`` is UTC in ISO 8601.
-    """
+    """Where a record came from. Hashes are SHA-256."""
 
     git: GitState
     versions: Mapping[str, str | None]
-    threads: Mapping[str, str | None]
+    threads: Mapping[str, str | None]  # environment variables that cap threads, and their values
     python: str
     platform: str
     machine: str
     cpu_count: int | None
     config_hash: str
-    mesh_hash: str
+    mesh_hash: str  # "none" without a mesh
     seed: int
-    finished: str
+    finished: str  # UTC, ISO 8601
 
 
 class Mesh(Frozen):
@@ -91,17 +78,13 @@ class Mesh(Frozen):
 
 
 class Model(Frozen):
-    """The estimator's model, as far as its cost depends on it.
-
-    ``cells`` are counted around the valve, from annulus to free edge, and through the thickness;
-    ``source`` is that of the mesh, ``noise_mm`` the SD of the errors of an observed coordinate.
-    """
+    """The estimator's model, as far as its cost depends on it."""
 
     element: str
-    cells: tuple[int, ...]
-    source: str | None = None
+    cells: tuple[int, ...]  # around the valve, from annulus to free edge, through the thickness
+    source: str | None = None  # of the mesh
     filter: str | None = None
-    noise_mm: float | None = None
+    noise_mm: float | None = None  # SD of the errors of an observed coordinate
 
 
 def _plain(tables: Mapping[str, Any]) -> dict[str, Any]:
@@ -109,45 +92,24 @@ def _plain(tables: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Result(Frozen):
-    """What a study returns: everything that its tables and figures show.
+    """What a study returns: everything that its tables and figures show."""
 
-    Attributes
-    ----------
-    tables : mapping of str to Table
-        Tidy tables by name, stored as plain data (see `table_of`); ``""`` is the main one.
-    numbers : mapping
-        Single values; a name ends with its unit. MLflow gets the numeric ones.
-    estimates : tuple of EstimateRecord
-    arrays : mapping
-        Stored next to the record, for figures; not part of it.
-    status : {"converged", "failed"}
-    reason, detail : str
-        Why the run ended.
-    mesh : Mesh or None
-    forward_solves : int
-    row : str
-        What tables call this run; empty: the configuration's ``row``.
-    parameters : tuple of str
-        Empty: those of the configuration.
-    model : Model or None
-        None: that of the configuration.
-    gate : str or None
-        Verdict of the gate on the anatomy (see `experiments.common.building.gate`); None for a
-        study without a configured anatomy.
-    """
-
+    # Tidy tables by name, stored as plain data (see `table_of`); "" is the main one.
     tables: Annotated[Mapping[str, Any], BeforeValidator(_plain)] = {}
+    # Single values; a name ends with its unit. MLflow gets the numeric ones.
     numbers: Mapping[str, Number] = {}
     estimates: tuple[EstimateRecord, ...] = ()
+    # Stored next to the record, for figures; not part of it.
     arrays: Annotated[Mapping[str, Any], Field(exclude=True)] = {}
     status: Status = "converged"
-    reason: str = "completed"
+    reason: str = "completed"  # why the run ended
     detail: str = ""
     mesh: Mesh | None = None
     forward_solves: int = 0
-    row: str = ""
-    parameters: tuple[str, ...] = ()
-    model: Model | None = None
+    row: str = ""  # what tables call this run; empty: the configuration's ``row``
+    parameters: tuple[str, ...] = ()  # empty: those of the configuration
+    model: Model | None = None  # None: that of the configuration
+    # Verdict of the gate on the configured anatomy (`experiments.common.building.gate`), if any.
     gate: str | None = None
 
     def changed(self, **values: Any) -> Self:
@@ -166,27 +128,15 @@ class Result(Frozen):
 
 
 class Record(Result):
-    """A finished run: the content of ``result.json`` and of the records in ``results/``.
+    """A finished run: the content of ``result.json`` and of the records in ``results/``."""
 
-    Attributes
-    ----------
-    version : int
-        Of this layout.
-    study, experiment, title, table : str
-        Kind of study, name of the configuration, and title and file name of its table.
-    factors : mapping
-        What is varied in this job of a sweep, by name.
-    seconds_total : float
-        From the start of the job to its record.
-    """
-
-    version: int
+    version: int  # of this layout
     study: str
-    experiment: str
-    title: str
-    table: str
-    factors: Mapping[str, Any]
-    seconds_total: float
+    experiment: str  # name of the configuration
+    title: str  # of its table
+    table: str  # file name of its table
+    factors: Mapping[str, Any]  # what is varied in this job of a sweep, by name
+    seconds_total: float  # from the start of the job to its record
     provenance: Provenance
 
     @property
@@ -234,10 +184,7 @@ def model_of_values(values: Mapping[str, Any]) -> Model:
 
 
 def stamp(values: Mapping[str, Any], config_hash: str, result: Result, started: float) -> Record:
-    """The record of what a study returned for a resolved configuration.
-
-    The job ``started`` so many seconds after the epoch.
-    """
+    """The record of a result; the job ``started`` so many seconds after the epoch."""
     found = {name: getattr(result, name) for name in Result.model_fields if name != "arrays"}
     found["row"] = result.row or values["row"]
     found["parameters"] = result.parameters or tuple(values["parameters"])
@@ -267,11 +214,8 @@ def here_and_now(config_hash: str, mesh_hash: str, seed: int) -> Provenance:
     )
 
 
-ARRAYS = "arrays_sha256"
-"""In a record's file, the digest of its arrays."""
-
-NEW_FIELDS = f"{PREFIX}{FIELDS}"
-"""Arrays of a record that is about to be written."""
+ARRAYS = "arrays_sha256"  # in a record's file, the digest of its arrays
+NEW_FIELDS = f"{PREFIX}{FIELDS}"  # arrays of a record that is about to be written
 
 
 def write_record(path: Path, record: Record, arrays: Mapping[str, Any] | None = None) -> None:
@@ -323,11 +267,5 @@ def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None)
 
 
 def read_record(path: Path) -> Record:
-    """The record in a file of a run's folder.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, is no such record, or was changed since it was written.
-    """
+    """The record in a file; raises an `InputError` if it is none or was changed."""
     return record_from(read_mapping(path), str(path), path.with_name(FIELDS))

@@ -20,8 +20,7 @@ from mvest.reporting.tables import Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LONGEST = 60
-"""Most rows of a table on a page; of a longer one the page names the file."""
+LONGEST = 60  # most rows of a table on a page; of a longer one the page names the file
 
 
 def write_results(folder: Path, study: Study[Any], results: Results) -> list[Path]:
@@ -58,27 +57,11 @@ def write_page(
 ) -> list[Path]:
     """Write tables as CSV, figures, and the page that shows these and earlier figures.
 
-    Parameters
-    ----------
-    base : Path
-        Folder and beginning of all names.
-    title : str
-    tables : mapping of str to Table
-        Part -> table; ``""`` is the main one.
-    summary : mapping of str to Table or None
-        Tables that readers see in place of `tables`.
-    records : sequence of Record
-        Those that the tables follow from.
-    figures : mapping of str to Figure
-    captions : mapping of str to str
-        Part -> caption of its figure.
-    latex : collection of str
-        Names of readers' tables that are also written as LaTeX, and of figures as PDF.
+    All file names begin with ``base``. Tables, figures and captions are named by their part of the
+    results, ``""`` for the main one. Readers see the tables of the ``summary``, if given, instead
+    of all. ``latex`` names the readers' tables that are also written as LaTeX, and figures as PDF.
 
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
+    Raises an `InputError` if a file cannot be written.
     """
     lines = sorted({record.line for record in records})
     comments = "".join(f"# {line}\n" for line in lines[:1])

@@ -11,11 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.common.cases import blind
-from experiments.common.cases.blind import (
-    SECRET,
-    estimate_blindly,
-    write_estimate,
-)
+from experiments.common.cases.blind import SECRET, estimate_blindly, write_estimate
 from experiments.common.records.record import Mesh, Model, Result
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown
@@ -25,21 +21,16 @@ from tests.places import ROOT
 WAYS = {
     "open": "open(secret)",
     "os.open": "os.open(secret, os.O_RDONLY)",
-    "Path.read_text": "Path(secret).read_text()",
     "numpy.load": "np.load(str(folder / 'positions.npz'))",
     "relative": "open(os.path.join('hidden', 'hidden.json'))",
-    "dots": "open(os.path.join('case', '..', 'hidden', 'hidden.json'))",
     "symlink to the folder": "open(os.path.join('door', 'hidden.json'))",
     "listdir": "os.listdir(folder)",
-    "scandir": "list(os.scandir(folder))",
     "chdir": "os.chdir(folder)",
     "rename": "os.rename(secret, 'out.json')",
     "rename the folder": "os.rename(folder, 'elsewhere')",
     "rename what holds it": "os.rename(root, str(root) + '_moved')",
-    "link": "os.link(secret, 'out.json')",
     "symlink": "os.symlink(folder, 'new_door')",
     "copy": "shutil.copyfile(secret, 'out.json')",
-    "remove": "os.remove(secret)",
     "write": "open(folder / 'new', 'w')",
     "sqlite": "sqlite3.connect(folder / 'new.db')",
 }
@@ -155,13 +146,6 @@ def test_the_process_is_given_nothing_of_the_patient(monkeypatch, tmp_path):
     assert given["personal"] == VALUES["personal"]
     assert found.estimates == left.estimates
     assert not any("4.321" in value or "24680" in value for value in heard.env.values())
-
-
-def test_a_process_that_leaves_nothing_is_told_by_its_last_words(monkeypatch, tmp_path):
-    with pytest.raises(InputError, match="the estimation of case left no result: the case is bad"):
-        asked(monkeypatch, tmp_path, VALUES, None, 2, "note\nerror: the case is bad\n")
-    with pytest.raises(InputError, match="left no result: exit status -9"):
-        asked(monkeypatch, tmp_path, VALUES, None, -9)
 
 
 def test_what_was_configured_of_a_patient_is_sealed(tmp_path):

@@ -7,8 +7,6 @@ from experiments.results.published import as_published
 from mvest.observation.errors import WhiteNoise
 from tests.experiments.configured import composed, plain
 
-"""Group that only some studies have -> an experiment of one that has it."""
-
 
 def test_a_hash_depends_on_what_changes_the_result_only() -> None:
     base = hash_of(composed("experiment=table1"))
@@ -62,21 +60,10 @@ def test_what_within_a_part_changes_no_number_is_no_part_of_the_hash() -> None:
 
 
 def test_the_usual_overrides_reach_the_objects() -> None:
-    config = plain(
-        composed(
-            "experiment=debug",
-            "filter=iterated",
-            "truth.values=[4.5,3.2]",
-            "filter.initial=[8,1.5]",
-            "filter.P0=[1,4]",
-            "mechanics.element=tet4",
-            "mechanics.reading=C",
-            "mesh.layers=1",
-            "observation.noise_mm=0.5",
-            "filter.R=[0.01,0.25]",
-        )
-    )
-    twin = build_twin(config)
+    words = ["filter=iterated", "truth.values=[4.5,3.2]", "filter.initial=[8,1.5]",
+             "mechanics.element=tet4", "mechanics.reading=C", "observation.noise_mm=0.5",
+             "filter.P0=[1,4]", "filter.R=[0.01,0.25]"]  # fmt: skip
+    twin = build_twin(plain(composed("experiment=debug", *words)))
     assert list(twin.truth_values) == [4.5, 3.2]
     assert list(twin.problem.prior.mean) == [8.0, 1.5]
     assert twin.problem.prior.covariance.diagonal().tolist() == [1.0, 4.0]
@@ -89,23 +76,6 @@ def test_the_usual_overrides_reach_the_objects() -> None:
     assert twin.truth_model is not twin.model
     assert twin.truth_model.fixed is not twin.model.fixed
     assert twin.truth_model.mesh.sha256 == twin.model.mesh.sha256
-
-
-def test_guides_are_coarser_down_to_the_coarsest() -> None:
-    config = plain(composed("mesh.columns=108", "mesh.rows=12"))
-    config["mechanics"]["element"] = "tet4"
-    twin = build_twin(config)
-    found, model = [], twin.model
-    while model.guide is not None:
-        model = model.guide
-        assert model.mesh.element_type == "hex18"
-        assert model.names == twin.model.names
-        assert model.valve is twin.model.valve
-        found.append(len(model.mesh.elements))
-    assert found == [54 * 6, 24 * 3]
-    # The truth is not guided, nor is who does not want to be.
-    assert twin.truth_model.guide is None
-    assert build_twin(plain(composed("guided=false"))).model.guide is None
 
 
 def test_a_population_is_drawn_from_what_its_estimator_states() -> None:

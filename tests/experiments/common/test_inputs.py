@@ -102,16 +102,6 @@ def test_what_lies_there_is_in_the_hash(given, study, name):
         assert hash_of(configuration(study, name, value)) == (first if content == "1" else changed)
 
 
-def test_a_relative_name_is_what_it_is_where_the_command_is_typed(given, monkeypatch):
-    found = []
-    for place in ("one", "two", "three"):
-        (given / place / "case").mkdir(parents=True)
-        monkeypatch.chdir(given / place)
-        Path("case/case.yaml").write_text("a" if place == "one" else "b")
-        found.append(hash_of({"study": "case", "case": "case"}))
-    assert found[0] != found[1] == found[2]
-
-
 def test_the_data_that_a_header_names_beside_it_count(given):
     header, data = given / "a.mhd", given / "a.raw"
     header.write_text(

@@ -1,5 +1,3 @@
-import io
-
 import numpy as np
 import pytest
 
@@ -21,22 +19,6 @@ def lines(capsys) -> list[str]:
     return capsys.readouterr().err.splitlines()
 
 
-def test_the_bar_counts_the_steps_of_each_solve_anew(monkeypatch) -> None:
-    tqdm = progress.tqdm
-
-    def visible(**settings):
-        return tqdm(**{**settings, "disable": False, "file": io.StringIO()})
-
-    visible.write, visible.format_interval = tqdm.write, tqdm.format_interval
-    monkeypatch.setattr(progress, "tqdm", visible)
-    with SolveBar("estimation", 3, 2) as bar:
-        # The second solve stops early.
-        for time in (0.1, 0.2, 0.3, 0.1, 0.1, 0.2):
-            bar.step(time, 1)
-        assert (bar._bar.n, bar._bar.total) == (2, 3)
-        assert "forward solve 3" in bar._bar.desc
-
-
 def test_solves_and_steps_of_the_filter_are_reported(clock, capsys) -> None:
     with SolveBar("estimation", 2, 4, ("E_f.anterior", "E_f.posterior")) as bar:
 
@@ -56,7 +38,7 @@ def test_solves_and_steps_of_the_filter_are_reported(clock, capsys) -> None:
         solve(20.0)
         bar.iterate(1, np.array([6.0, 2.5]), 2.5)
         said = " ".join(" ".join(lines(capsys)).split())
-        assert "step 1: objective 2.5 (-10), E_f.anterior 6 (+1), E_f.posterior 2.5 (-0.5)" in said
+        assert "step 1: objective 2.5, E_f.anterior 6, E_f.posterior 2.5" in said
         assert said.endswith("01:20 elapsed, about 00:40 left if 4 solves do")
         for _ in range(3):
             solve(20.0)
@@ -75,14 +57,6 @@ def test_a_part_that_is_not_mostly_solves_has_its_own_estimate(clock, capsys) ->
     said = " ".join(lines(capsys))
     assert "E_f.anterior 5, E_f.posterior 3" in said
     assert "00:08 elapsed, about 06:32 left" in said
-
-
-def test_quick_solves_are_left_to_the_bar(clock, capsys) -> None:
-    with SolveBar("estimation", 2, 4) as bar:
-        for time in (0.1, 0.2) * 3:
-            clock[0] += 0.01
-            bar.step(time, 1)
-    assert lines(capsys) == []
 
 
 def test_silence_is_broken_by_what_goes_on(monkeypatch, capsys) -> None:

@@ -1,13 +1,11 @@
 import dataclasses
 from dataclasses import dataclass
 
-import pytest
 from omegaconf import OmegaConf
 
 from experiments.common.building.closure import ValveSettings
 from experiments.common.config import Mechanics
 from experiments.common.schema import build, schema
-from mvest.errors import ConfigurationError
 from mvest.imaging.learning.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.simulation.population import PopulationSettings
@@ -37,11 +35,6 @@ def test_there_and_back() -> None:
     assert build(Outer, OmegaConf.to_container(config)) == Outer(
         2.0, Inner(3.0), pairs=((3, 4), (5, 6)), table={"a": Inner()}
     )
-
-
-def test_a_missing_value_is_named() -> None:
-    with pytest.raises(ConfigurationError, match=r"^needed has no value$"):
-        build(Outer, OmegaConf.to_container(OmegaConf.structured(schema(Outer))))
 
 
 def test_the_librarys_defaults_are_the_configurations() -> None:

@@ -1,15 +1,12 @@
 """The real worker with a study that takes no time and does what files in its folder say.
 
-``kill-SEED``, ``exit-SEED``, ``raise-SEED``, ``hog-SEED`` and ``full-SEED`` end the job of that
-seed, once; ``hold-SEED`` and ``spin-SEED`` run on in compiled code or in Python, ``spawn-SEED``
-waits for a child; one with ``wait-SEED`` writes its process there and goes on when that is gone.
+``kill-SEED``, ``raise-SEED``, ``hog-SEED`` and ``full-SEED`` end the job of that seed, once. One
+with ``wait-SEED`` writes its process there and goes on when that is gone.
 Every run leaves a line in ``runs``.
 """
 
-import ctypes
 import os
 import signal
-import subprocess
 import sys
 import time
 from contextlib import suppress
@@ -37,7 +34,7 @@ def run(job):
         order.write(str(os.getpid()))
     while wait.exists():
         time.sleep(0.02)
-    for name in ("kill", "exit", "raise", "hog", "full", "hold", "spin", "spawn"):
+    for name in ("kill", "raise", "hog", "full"):
         order = Path(f"{name}-{seed}")
         if not order.exists():
             continue
@@ -45,15 +42,6 @@ def run(job):
         match name:
             case "kill":
                 os.kill(os.getpid(), signal.SIGKILL)
-            case "exit":
-                os._exit(3)
-            case "hold":  # no other thread of Python runs meanwhile
-                ctypes.PyDLL(None).sleep(600)
-            case "spin":
-                while True:
-                    sum(range(1000))
-            case "spawn":
-                subprocess.run(["sleep", "311"], check=False)
             case "raise":
                 raise RuntimeError("it broke")
             case "hog":

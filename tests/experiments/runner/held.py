@@ -3,7 +3,6 @@
 There it writes a file ``at`` and waits.
 """
 
-import ctypes
 import signal
 import sys
 import time
@@ -15,11 +14,8 @@ from tests.experiments.runner import fake_worker
 PROGRAM = "trap '' TERM HUP INT; sleep 300 & setsid sleep 300 & : > ../../../at; wait; wait"
 """An external program that ignores signals, with two child processes."""
 
-HELD_FILE = {
-    "writing": "result.json",
-    "drawing": "sweep_debug.png",
-}
-"""Stage -> file that is complete but not renamed yet."""
+HELD_FILE = "sweep_debug.png"
+"""In the stage "drawing", it is complete but not renamed yet."""
 
 
 def stage() -> str:
@@ -33,22 +29,17 @@ def hold() -> None:
 
 
 def held_replace(path, target, replaced=Path.replace):
-    if Path(target).name == HELD_FILE.get(stage()):
+    if stage() == "drawing" and Path(target).name == HELD_FILE:
         hold()
     return replaced(path, target)
 
 
 def run(job):
-    match stage():
-        case "simulating":
-            from mvest.exchange.external.contract import Command
+    if stage() == "simulating":
+        from mvest.exchange.external.contract import Command
 
-            with Command(("/bin/sh", "-c", PROGRAM)).started(job.folder) as ended:
-                ended()
-        case "estimating":
-            Path("at").touch()
-            # As a long call of compiled code: no other thread of Python runs meanwhile.
-            ctypes.PyDLL(None).sleep(600)
+        with Command(("/bin/sh", "-c", PROGRAM)).started(job.folder) as ended:
+            ended()
     return fake_worker.run(job)
 
 

@@ -66,11 +66,7 @@ def look_at(address: str, what: str) -> str:
         command = [program, *FLAGS, window, f"--user-data-dir={profile}", what, address]
         try:
             seen = run(
-                command,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                timeout=PATIENCE,
+                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, timeout=PATIENCE
             )
             seen.check_returncode()
         except (subprocess.SubprocessError, OSError) as error:

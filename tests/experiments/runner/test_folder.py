@@ -9,6 +9,7 @@ import yaml
 
 from experiments.common.records import record as records
 from experiments.common.records.record import FIELDS
+from experiments.common.schema import build
 from experiments.common.study import Result
 from experiments.runner import jobs
 from experiments.runner.jobs import Request
@@ -87,18 +88,10 @@ def test_a_kill_while_arrays_and_record_are_replaced_loses_neither(tmp_path, mon
     assert number(asked) == (2.0 if step == "adopt_arrays" else 1.0)
 
 
-def test_another_configurations_result_stays_until_it_is_replaced(tmp_path):
-    asked = request(tmp_path)
-    finish(asked, 1.0)
-    jobs.make_way(Request(asked.values, "1" * 64, tmp_path))
-    assert number(asked) == 1.0
-    assert jobs.last_record(tmp_path, "1" * 64) is None
-
-
 def test_a_request_keeps_its_overrides(tmp_path):
     plain = request(tmp_path)
     asked = Request(plain.values, plain.config_hash, tmp_path, None, ("seed=2", "+a='b c'"))
-    assert Request.from_json(json.loads(json.dumps(asked.to_json()))) == asked
+    assert build(Request, json.loads(json.dumps(asked.to_json()))) == asked
     jobs.write_hydra(asked)
     place = tmp_path / jobs.HYDRA
     assert yaml.safe_load((place / "overrides.yaml").read_text()) == ["seed=2", "+a='b c'"]

@@ -1,32 +1,18 @@
 """A process apart: its death, its time and its memory cost its own job, and it leaves with us."""
 
-import errno
-import fcntl
 import json
 import os
 import signal
-import subprocess
 import sys
-import time
+import threading
 from pathlib import Path
 
 import pytest
 
 from experiments.common.records.record import Record, stamp, write_record
 from experiments.common.study import Result
-from experiments.runner import job as child
 from experiments.runner.engine import WorkerProcess
-from experiments.runner.jobs import (
-    Request,
-    attempt,
-    is_done,
-    last_record,
-    lock,
-    mark_done,
-)
-from mvest.errors import ConfigurationError, InputError
-from mvest.provenance import write_json
-from tests.places import ROOT
+from experiments.runner.jobs import Request, attempt, is_done, last_record, lock, mark_done
 
 OBEDIENT = """
 import json, os, sys, time
@@ -55,38 +41,19 @@ def run_in(worker: WorkerProcess, asked: Request) -> Record:
     return attempt(asked, lambda: worker.run(asked))
 
 
-TRUTH = {
-    "values": [1.0],
-    "refine": 1,
-    **dict.fromkeys(("element", "source", "columns", "rows", "layers")),
-}
-
-MESH = {"columns": 1, "rows": 1, "layers": 1, "source": "structured", "edge_length": 2.5}
+VALUES = {
+    "study": "twin", "name": "a", "title": "b", "row": "c", "table": "d", "paper": None, "seed": 1,
+    "parameters": ["x"], "factors": {"k": 1}, "filter": {"initial": [2.0], "mode": "paper"},
+    "truth": {"values": [1.0], "refine": 1,
+              **dict.fromkeys(("element", "source", "columns", "rows", "layers"))},
+    "observation": {"noise_mm": 0.0}, "mechanics": {"element": "hex18", "tissue": {}},
+    "mesh": {"columns": 1, "rows": 1, "layers": 1, "source": "structured", "edge_length": 2.5},
+    "tracking": {"enabled": False}, "force": False, "figures": False, "memory_limit_gb": None,
+}  # fmt: skip
 
 
 def request(folder: Path, **order) -> Request:
-    values = {
-        **{
-            "study": "twin",
-            "name": "a",
-            "title": "b",
-            "row": "c",
-            "table": "d",
-            "paper": None,
-            "seed": 1,
-        },
-        **{"parameters": ["x"], "factors": {"k": 1}, "truth": TRUTH},
-        **{"filter": {"initial": [2.0], "mode": "paper"}, "observation": {"noise_mm": 0.0}},
-        **{
-            "mechanics": {"element": "hex18", "tissue": {}},
-            "tracking": {"enabled": False},
-            "force": False,
-        },
-        **{"mesh": MESH, "figures": False},
-        "time_limit_s": order.pop("limit", None),
-        "memory_limit_gb": None,
-        "order": order,
-    }
+    values = VALUES | {"time_limit_s": order.pop("limit", None), "order": order}
     return Request(values, "0" * 64, folder)
 
 
@@ -144,8 +111,7 @@ def test_a_healthy_process_is_kept_and_another_is_replaced(worker, tmp_path):
     assert second != first
     os.kill(second, signal.SIGKILL)
     # Found dead between two jobs, it costs none.
-    while worker._program.process.poll() is None:
-        time.sleep(0.01)
+    worker._program.process.wait(60)
     assert pid() not in (first, second)
 
 
@@ -159,20 +125,6 @@ def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
     assert not is_done(tmp_path)
 
 
-def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_path, capsys):
-    asked = request(tmp_path)
-    converged(asked)
-    mark_done(tmp_path)
-    write_json(tmp_path / "result.json", changed(tmp_path, numbers={"a_mm": 2.0}))
-    assert last_record(tmp_path, "0" * 64) is None
-    run_in(worker, asked)
-    assert said(tmp_path), "the worker was asked"
-    assert capsys.readouterr().err.splitlines() == [
-        f"note: {tmp_path / 'result.json'}: its content is not what was written (SHA-256 does not "
-        "match); it is computed again"
-    ]
-
-
 @pytest.mark.parametrize("order", [{"signal": int(signal.SIGKILL)}, {"reason": "no space left"}])
 def test_what_was_computed_outlives_whatever_ends_the_job_after_it(worker, tmp_path, order, capsys):
     asked = request(tmp_path, **order)
@@ -184,80 +136,26 @@ def test_what_was_computed_outlives_whatever_ends_the_job_after_it(worker, tmp_p
     assert run_in(worker, asked).status == "failed"
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        *("{}", "", "[" * 9999, '{"version": 3, "provenance": 3}'),
-    ],
-)
-def test_a_damaged_result_is_none(worker, tmp_path, content):
-    (tmp_path / "result.json").write_text(content)
+@pytest.mark.parametrize("content", ["", '{"version": 3, "provenance": 3}', None])
+def test_a_damaged_or_changed_result_is_none(worker, tmp_path, content):
+    converged(request(tmp_path))
+    changes = json.dumps(changed(tmp_path, numbers={"a_mm": 2.0}))
+    (tmp_path / "result.json").write_text(changes if content is None else content)
     mark_done(tmp_path)
     assert last_record(tmp_path, "0" * 64) is None
     assert run_in(worker, request(tmp_path, exit=3)).status == "failed"
 
 
-def test_a_second_process_says_that_it_waits_for_the_folder(tmp_path):
-    code = (
-        "import sys; from pathlib import Path; from experiments.runner.jobs import lock\n"
-        "with lock(Path(sys.argv[1])): print('in', flush=True); sys.stdin.read()"
-    )
-
-    def start():
-        return subprocess.Popen(
-            [sys.executable, "-c", code, str(tmp_path)],
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    processes = [start()]
-    try:
-        assert processes[0].stdout.readline() == "in\n"
-        processes.append(start())
-        waits = f"waiting for another process that works in {tmp_path}\n"
-        assert processes[1].stderr.readline() == waits
-        # The lock falls with whoever held it, however it ended.
-        processes[0].kill()
-        assert processes[1].stdout.readline() == "in\n"
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
-
-
-@pytest.mark.parametrize(
-    ("number", "words"),
-    [(errno.ENOLCK, "No locks available")],
-)
-def test_a_folder_that_cannot_be_locked_is_named(tmp_path, monkeypatch, number, words):
-    def fails(*_):
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(fcntl, "flock", fails)
-    with pytest.raises(InputError) as refused, lock(tmp_path):
-        pass
-    assert str(refused.value) == f"cannot lock {tmp_path / '.lock'}: {words}"
-
-
-"""The real worker, in the middle of a computation that never ends."""
-
-
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (ConfigurationError("mesh.rows = 0"), "mesh.rows = 0"),
-        (MemoryError(), "MemoryError"),
-        (OSError(28, "No space left on device", "a/b"), "a/b: No space left on device"),
-        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
-    ],
-)
-def test_the_worker_answers_whatever_a_job_raises(tmp_path, monkeypatch, error, reason):
-    def fail(*_):
-        raise error
-
-    monkeypatch.setattr(child, "compute", fail)
-    answered = child.answer(request(tmp_path), 4.0)
-    assert answered == {"reason": reason, "refused": isinstance(error, ConfigurationError)}
+def test_who_finds_the_folder_locked_waits_and_says_so(tmp_path, capsys):
+    first = lock(tmp_path)
+    second = threading.Thread(target=lambda: lock(tmp_path).lock.release())
+    second.start()
+    waits = f"waiting for another process that works in {tmp_path}\n"
+    said = ""
+    while not said:
+        said = capsys.readouterr().err
+    assert said == waits
+    assert second.is_alive()
+    first.lock.release()
+    second.join(60)
+    assert not second.is_alive()

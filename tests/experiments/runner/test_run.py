@@ -28,78 +28,44 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert finished.returncode == 0, finished.stderr
     assert "E_f.anterior (MPa)" in finished.stdout
     (folder,) = (tmp_path / "outputs" / "debug").iterdir()
-    # Read with its types, every field there.
     record = read_record(folder / "result.json")
-    provenance = record.provenance
     (first,) = record.estimates
     assert record.converged
-    assert record.parameters == ("E_f.anterior", "E_f.posterior")
-    assert record.reason
     assert record.forward_solves > first.iterations > 0
-    assert first.seconds > 0
     # Two estimated moduli, and the four that follow from them.
     assert [unknown.kind for unknown in first.unknowns] == ["modulus"] * 2 + ["derived"] * 4
-    assert all(unknown.std > 0 for unknown in first.moduli)
-    assert first.distance_mm.max >= first.distance_mm.mean
     assert max(abs(unknown.relative_error) for unknown in first.unknowns) < 1e-4
-    assert provenance.config_hash.startswith(folder.name)
-    assert set(provenance.threads.values()) == {"1"}
+    assert record.provenance.config_hash.startswith(folder.name)
+    assert set(record.provenance.threads.values()) == {"1"}
     names = {path.name for path in folder.iterdir()}
-    assert {
-        "debug.csv",
-        "debug.md",
-        "debug.png",
-        "debug_valve.png",
-        "config.json",
-    } <= names
+    assert {"debug.csv", "debug.md", "debug.png", "debug_valve.png", "config.json"} <= names
     assert not [name for name in names if name.startswith(PREFIX)]
-    assert not (tmp_path / "results").exists()
 
     with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
-        assert database.execute("select name from experiments where name = 'debug'").fetchall()
         tags = dict(database.execute("select key, value from tags").fetchall())
         metrics = dict(database.execute("select key, value from latest_metrics").fetchall())
-        settings = dict(database.execute("select key, value from params").fetchall())
-    assert tags["config_hash"] == provenance.config_hash
-    assert tags["status"] == "converged"
-    assert {"mlflow.user", "mlflow.source.git.commit", "result_hash", "plausible"} <= set(tags)
+    assert tags["config_hash"] == record.provenance.config_hash
     assert metrics["estimate.anterior"] == pytest.approx(first.moduli[0].estimate)
-    assert settings["mechanics.element"] == "hex18"
-    assert len(list((tmp_path / "outputs" / "mlartifacts").rglob("result.json"))) == 1
 
 
 ERRORS = [
     ("experiment=tabel1", "Could not find 'experiment/tabel1'; did you mean table1? known: "),
-    ("mesh/nope=a", "Key 'mesh/nope'"),
     ("filter.inital=[1,2]", "did you mean initial?"),
     ("sed=3", "did you mean seed?"),
     ("seed=abc", "seed: Value 'abc' of type 'str' could not be converted to Integer"),
-    ("observation.noise_mm=[1]", "observation.noise_mm"),
     ("filter=[", "filter=[: no viable alternative"),
     ("truth.values=[1]", "truth.values has 1 values"),
     ("truth.values=[-1,2]", "truth.values of E_f.anterior = -1, expected 1e-06 to"),
     ("filter.P0=[[1,2],[2,1]]", "positive semi-definite"),
-    ("filter.P0=much", "filter.P0 = 'much', expected a number"),
     ("filter.R=[1,2,3]", "R has shape (3,)"),
-    ("filter.method.tolerance=0", "filter tolerance = 0"),
     ("observation.frames=[shut]", "observed frames ['shut']"),
-    ("observation.columns=7", "valve of 7 x 7 vertices"),
     ("mechanics.element=hex99", "hex99"),
-    ("mechanics.solver=magic", "unknown linear solver 'magic'"),
-    ("mesh.source=clay", "mesh.source = 'clay', expected structured or tetwild"),
-    ("mesh=unstructured", "an unstructured mesh needs tet10 or tet4"),
-    ("valve.leaflets.edge_thinning=0", "template leaflets.edge_thinning = 0.0"),
     ("parameters=[E_f.middle,E_f.posterior]", "parameter 'E_f.middle': unknown 'middle'"),
-    ("mesh.columns=100000", "mesh.columns = 100000, expected 1 to 400"),
-    ("mechanics.density=nan", "mechanics.density is nan"),
     ("study=magic", "Could not find 'study/magic'; known: case"),
     ("hydra.run.dir=file/below", "file/below: Not a directory"),
     ("tracking.uri=postgresql://me:secret@localhost/mvest", "tracking.uri holds a password"),
-    ("mesh=null", "mesh=null: "),
     ("~filter", "filter.initial has no value"),
-    ("--experiment", "unrecognized arguments: --experiment; settings are NAME=VALUE"),
     ("name=../escape", "name = '../escape', expected a name"),
-    ("+sweep.name=../escape", "sweep.name = '../escape', expected a name"),
     ("hydra.run.dir=${paths.outputs}/${name}/x name=..", "expected a name"),
 ]  # fmt: skip
 
@@ -204,10 +170,7 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
 
 FAILURES = {
     "figure": ("matplotlib.figure.Figure.savefig", ValueError("no glyph for U+D800")),
-    "marker": (
-        "experiments.runner.job.mark_done",
-        OSError(28, "No space left on device"),
-    ),
+    "marker": ("experiments.runner.jobs.mark_done", OSError(28, "No space left on device")),
 }
 
 

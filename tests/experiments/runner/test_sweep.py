@@ -5,7 +5,6 @@ import json
 import math
 import os
 import re
-import resource
 import shutil
 import sys
 from dataclasses import replace
@@ -15,8 +14,7 @@ import pytest
 import yaml
 
 from experiments.results.published import records_of
-from experiments.runner import engine, jobs, plugins, sweep
-from experiments.runner.plan import Plan
+from experiments.runner import engine, plugins, sweep
 from experiments.studies import twin
 from experiments.sweeps.collected import Sweep, read_sweep
 from mvest.files import sha256_of
@@ -203,23 +201,14 @@ def test_an_experiment_of_several_runs_keeps_a_record_of_each(run, monkeypatch):
     usual = ("experiment=mesh_independence", "paths.results=published")
     status, _, err = run(*usual)
     assert status == 0, err
-    names = [
-        "mesh-independence-hex18-structured-36-x-4",
-        "mesh-independence-hex18-structured-36-x-8",
-        "mesh-independence-hex18-structured-40-x-5",
-        "mesh-independence-hex18-structured-54-x-6",
-        "mesh-independence-hex18-structured-72-x-8",
-    ]
-    kept = records_of(Path("published"), "mesh_independence")
-    assert kept is not None
-    assert list(kept.records) == names
+    names = [f"mesh-independence-hex18-structured-{n}" for n in
+             ("36-x-4", "36-x-8", "40-x-5", "54-x-6", "72-x-8")]  # fmt: skip
+    assert list(records_of(Path("published"), "mesh_independence").records) == names
     # What was done before is taken over where the results have lost it.
     shutil.rmtree("published")
     assert run(*usual)[0] == 0
     assert len(runs()) == 5
-    kept = records_of(Path("published"), "mesh_independence")
-    assert kept is not None
-    assert list(kept.records) == names
+    assert list(records_of(Path("published"), "mesh_independence").records) == names
 
 
 WRONG = [
@@ -313,34 +302,6 @@ def test_a_job_beyond_its_memory_costs_its_own_row(run):
     assert 0.4 < float(found[1]) <= 0.5
     status, _, _ = run("sweep=debug", "memory_limit_gb=0.5")
     assert status == 0
-
-
-def test_a_run_by_itself_is_held_to_its_memory(run, monkeypatch):
-    def hog(job):
-        kept = []
-        while True:
-            kept.append(b"x" * 2**24)
-
-    monkeypatch.setattr(twin, "STUDY", replace(twin.STUDY, run=hog))
-    resident = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-    limit = round(resident / jobs.GB + 0.2, 2)
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    status, _, err = run("experiment=debug", f"memory_limit_gb={limit}")
-    assert status == 1
-    assert err.startswith(f"no estimate: memory limit of {limit:.3g} GB (used: up to ")
-    (record,) = Path("outputs/debug").glob("*/result.json")
-    assert json.loads(record.read_text())["reason"].startswith("memory limit of")
-    assert resource.getrlimit(resource.RLIMIT_DATA) == before
-
-
-@pytest.mark.parametrize(
-    ("given", "limit"),
-    [((), 14_400.0), (("time_limit_s=null",), None)],
-)
-def test_jobs_of_a_sweep_have_a_time_limit_unless_it_is_taken_away(run, given, limit):
-    status, _, err = run("sweep=debug", "detach=true", *given)
-    assert status == 0, err
-    assert {job.values["time_limit_s"] for job in Plan.read(DEBUG).jobs} == {limit}
 
 
 def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):

@@ -13,12 +13,9 @@ from experiments.common.building.twin import build_twin
 from experiments.common.cases.blind import SECRET
 from experiments.common.config import hash_of, register, require_in_range
 from experiments.common.schema import build
-from experiments.common.study import Job, Result
 from experiments.runner.compose import expand, make_plan
 from experiments.runner.jobs import TIME_LIMIT_S
 from experiments.runner.plugins import register_plugins
-from experiments.studies.twin import Settings, run_twin
-from mvest.errors import MvestError
 from mvest.simulation.virtual_patient import PatientSettings
 from tests.places import CONF
 
@@ -121,26 +118,6 @@ def test_the_truth_of_a_discrepancy_is_another_one_and_its_key_too(configuration
             assert twin.truth_model.settings.tissue["anterior"].ratio == 3.181
             assert twin.model.settings.tissue["anterior"].ratio == pytest.approx(2.651, abs=1e-3)
     assert len(keys) == len(set(keys.values())) == 12
-
-
-def ran(overrides: tuple[str, ...], folder: Path) -> Result:
-    config_hash, config = composed(*overrides)
-    return run_twin(Job(config, Settings(), folder, config_hash))
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("truth.reading=Z", "expected one of A, C"),
-        ("+truth.ratio.septal=1.0", "region 'septal'"),
-        ("+truth.fixed.presure_scale=1.1", "truth.fixed: unknown parameter 'presure_scale'"),
-        ("observation.dropout_mm=-1", "drop-out distance = -1.0, expected >= 0"),
-    ],
-)
-def test_a_wrong_setting_is_refused_before_anything_runs(configuration, override, words) -> None:
-    _, config = composed(*DEBUG, override)
-    with pytest.raises(MvestError, match=words):
-        build_twin(config)
 
 
 def test_each_world_changes_what_its_estimator_is_not_given(configuration) -> None:

@@ -109,20 +109,6 @@ def sweep(name: str, jobs: Iterable[SweptJob], **changes: Any) -> Sweep:
     return Sweep(**{**whole, **changes})
 
 
-def starts(name: str = "starts") -> Sweep:
-    """Two filters from nine starts; one start of each kills its job."""
-    jobs = []
-    for filter_ in ("iterated", "paper"):
-        for a in (1.0, 4.0, 9.0):
-            for b in (0.5, 2.0, 8.0):
-                error = 1e-4 * a * b if filter_ == "paper" else 1e-6
-                good = (a, b) != (9.0, 8.0)
-                runs = [run(1, TRUTH * (1 + error), [0.02, 0.005], start=(a, b))] if good else []
-                factors = {"start_anterior": a, "start_posterior": b, "filter": filter_}
-                jobs.append(job(factors, runs, "killed"))
-    return sweep(name, jobs)
-
-
 def noise(seeds: int = 20) -> Sweep:
     """White noise at four levels with errors of its size, and an offset at one."""
     rng = np.random.default_rng(2)

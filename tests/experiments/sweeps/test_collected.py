@@ -7,7 +7,6 @@ import pytest
 from experiments.sweeps.collected import Sweep, head_of, read_sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import InputError
-from tests.experiments.studies.made_up import SOURCE
 from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, lost, noise, run, sweep
 
 HOSTILE = r"<b>x</b> | 5 % & $y$ \input{z}_1"
@@ -60,32 +59,6 @@ def test_a_damaged_sweep_is_named(tmp_path, damage, words):
     path.write_text(json.dumps(data))
     with pytest.raises(InputError, match=words):
         read_sweep(path)
-
-
-def test_equal_sweeps_give_equal_files_whenever_they_ran(tmp_path):
-    first = small()
-    # What may differ between an undisturbed sweep and one that was killed and taken up again.
-    source = SOURCE.model_copy(update={"finished": "2031-01-01T00:00:00Z", "cpu_count": 99})
-
-    def later(one):
-        estimates = tuple(e.model_copy(update={"seconds": 1e3}) for e in one.record.estimates)
-        more = {"finished": source.finished, "config_hash": one.record.provenance.config_hash}
-        record = one.record.model_copy(
-            update={
-                "estimates": estimates,
-                "seconds_total": 1e3,
-                "provenance": source.model_copy(update=more),
-            }
-        )
-        return one.model_copy(update={"record": record})
-
-    second = first.model_copy(
-        update={"provenance": source, "jobs": tuple(later(one) for one in first.jobs)}
-    )
-    for name, whole in (("a", first), ("b", second)):
-        (tmp_path / name).mkdir()
-        write_sweep(tmp_path / name, whole)
-    assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
 def test_hostile_names_act_in_no_file(tmp_path):

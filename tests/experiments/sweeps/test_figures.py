@@ -3,14 +3,7 @@
 import pytest
 
 from experiments.sweeps.figures import figures_of
-from tests.experiments.sweeps.made_up_sweeps import (
-    TRUTH,
-    failed_run,
-    job,
-    run,
-    starts,
-    sweep,
-)
+from tests.experiments.sweeps.made_up_sweeps import TRUTH, failed_run, job, run, sweep
 
 
 def axes_of(figure, label: str):
@@ -56,18 +49,6 @@ def test_numbers_stand_at_their_value_where_that_is_more_even_and_zero_has_a_pla
 
     assert places([float(k) for k in range(1, 7)]) == [1, 2, 3, 4, 5, 6]
     assert places([0.0, 0.01, 0.1, 1.0]) == pytest.approx([-3, -2, -1, 0])
-
-
-def test_the_matrix_has_a_cell_for_each_pair_and_marks_failures():
-    figure = figures_of(starts())["matrix"]
-    iterated, paper = figure.axes[:2]
-    assert [axes.get_title() for axes in (iterated, paper)] == ["filter: iterated", "filter: paper"]
-    for axes in (iterated, paper):
-        texts = [text.get_text() for text in axes.texts]
-        assert len(texts) == 9
-        assert texts.count("×") == 1
-    # 1e-4 x 4 x 2 of the truth, in percent.
-    assert "0.08" in [text.get_text() for text in paper.texts]
 
 
 def test_the_matrix_shows_the_worst_parameters_root_mean_square():

@@ -13,10 +13,8 @@ from tests.experiments.sweeps.made_up_sweeps import (
     TRUTH,
     failed_run,
     job,
-    lost,
     noise,
     run,
-    starts,
     sweep,
 )
 
@@ -134,10 +132,3 @@ def test_failures_are_counted_by_their_kind_whatever_their_numbers():
     assert row["failures"] == f"2 x no rounds left{NOT_THE_POSTERIOR}; no rounds left"
     assert "failures" in by_setting(whole).readable()[0]
     assert "failures" not in by_setting(noise(2)).readable()[0]
-
-
-@pytest.mark.parametrize("whole", [starts(), noise(2), sweep("x", [job({}, [])])])
-def test_a_sweep_without_any_result_is_still_a_table(whole):
-    rows = by_setting(lost(whole)).rows
-    assert sum(row["failed"] for row in rows) == sum(2 * len(one.runs) for one in whole.jobs)
-    assert all(row["estimate"] is None for row in rows)
