@@ -142,21 +142,3 @@ def test_fibres_run_round_the_valve_unless_given(tmp_path):
     cosine = np.abs(np.einsum("ij,ij->i", case.surface.fibre, tangent))
     # Level lines of s are near those of the template's own s; along the leaflet would give 0.
     assert np.median(cosine) > 0.98
-
-
-def test_pressures_come_from_the_curve_where_they_are_not_given(tmp_path):
-    document = plain_folder(tmp_path)
-    for entry, time in zip(document["frames"], (0.40, 0.65), strict=True):
-        entry["time"] = time
-        del entry["pressure"]
-    case = read_case(save(tmp_path, document))
-    # LV 6 - LA 7 at 0.40 s; a plateau near 120 mmHg in systole.
-    assert case.frames[0].pressure_mmHg == pytest.approx(-1.0)
-    assert 110 < case.frames[1].pressure_mmHg < 125
-    assert sum("generic transmitral curve" in sentence for sentence in case.derived) == 2
-    (tmp_path / "p.csv").write_text("time,pressure\n0.3,-2\n0.5,10\n0.7,15.0\n")
-    document |= {"pressure_curve": "p.csv", "units": {"length": "mm", "pressure": "kPa"}}
-    document["frames"][1]["time"] = 0.7
-    case = read_case(save(tmp_path, document))
-    assert case.frames[1].pressure_mmHg == pytest.approx(15.0 / 0.133322387415)
-    assert not any("pressure" in sentence for sentence in case.derived)
