@@ -139,6 +139,7 @@ def _alike(observation: Observed, standardised: FloatArray) -> float | None:
     one_way = coo_matrix((ones, (rows, near[:, 1:].ravel())), shape=(len(points),) * 2)
     neighbours = csr_array(one_way.maximum(one_way.T))
     statistics = [
-        moran(column, neighbours) * min(1.0, float(np.var(column))) for column in values.T
+        moran(column, neighbours) * min(1.0, float(np.var(column))) if np.ptp(column) else 0.0
+        for column in values.T
     ]
     return float(max(statistics, key=abs))

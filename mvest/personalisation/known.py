@@ -169,10 +169,13 @@ class LinearModel:
             return np.einsum("...j,jk,...k->...", slopes_, covariance, slopes_)
         images = np.array(self.sources) == IMAGES
         rest = slopes_[..., ~images]
-        variance = np.einsum("...j,jk,...k->...", rest, covariance[~images][:, ~images], rest)
+        # With unit priors, the covariance with the samples is minus their effect on the estimate.
+        effect = -covariance[~images][:, images]
+        others = covariance[~images][:, ~images] - effect @ effect.T
         # A sample moves the valve directly, and the estimate through the gain.
-        moved = slopes_[..., :p] @ self._sampled.moved - slopes_[..., images]
-        return np.asarray(variance + np.sum(moved**2, axis=-1))
+        effect[:p] = self._sampled.moved
+        moved = rest @ effect - slopes_[..., images]
+        return np.einsum("...j,jk,...k->...", rest, others, rest) + np.sum(moved**2, axis=-1)
 
     @cached_property
     def parts(self) -> dict[str, FloatArray]:

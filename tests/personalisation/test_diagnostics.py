@@ -89,6 +89,7 @@ def test_the_pattern_is_that_of_the_last_surface(smooth):
     points = seen.seen[smooth].points
     values[first : first + len(points)] = np.sin(points[:, 0] / 5.0)
     assert (_alike(seen, values) > 0.3) == (smooth == 1)
+    assert _alike(seen, np.zeros_like(values)) == 0.0  # as for data without errors
 
 
 @pytest.mark.parametrize(("times", "doubtful"), [(3.0, True), (1.9, False)])

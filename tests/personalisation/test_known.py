@@ -8,11 +8,20 @@ import pytest
 
 from mvest.cases.case import ErrorSamples, Role
 from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import observation_noise
+from mvest.estimation.sampled import SampledErrors
 from mvest.estimation.transform import Identity, to_filter
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation import personalise
 from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
-from mvest.personalisation.known import EXACTLY, PRESSURE_MMHG, REACH, SINGLE, data_alone
+from mvest.personalisation.known import (
+    EXACTLY,
+    PRESSURE_MMHG,
+    REACH,
+    SINGLE,
+    LinearModel,
+    data_alone,
+)
 from mvest.personalisation.sources import FrameSamples
 from mvest.valve.measure.strain import mean_strains
 from tests.made_up_closure import (
@@ -195,3 +204,15 @@ def test_an_error_that_the_moduli_undo_hardly_changes_the_strain(monkeypatch):
     ]
     # Without the compensation it would be sixteen times.
     assert np.all(np.array(widths[1]) < 8.0 * np.array(widths[0]))
+
+
+def test_error_samples_count_once_in_the_variance_of_a_function():
+    rng = np.random.default_rng(6)
+    base = observation_noise(0.01**2, 20)
+    samples = SampledErrors(base, rng.standard_normal((20, 400)))
+    errors = SimpleNamespace(
+        samples=samples, sources=(), source_sizes=lambda _: {}, single_noise=lambda *_, **__: base
+    )
+    model = LinearModel(("E_f.a", "E_f.b"), np.eye(2), rng.standard_normal((20, 2)), errors)
+    of_unknowns = model.variance_of(np.eye(2, 2 + 400))
+    np.testing.assert_allclose(of_unknowns, model.variances(), rtol=0.05)
