@@ -43,7 +43,6 @@ def personalise(
 
     Parameters
     ----------
-    case : ValveCase
     settings : PersonaliseSettings, optional
         Default: `default_settings`.
     store : Path, optional
@@ -96,7 +95,6 @@ def predicted_frames(
 
     Parameters
     ----------
-    problem : CaseProblem
     point : LinearisationPoint
         Its closure predicts.
     m : (p,)

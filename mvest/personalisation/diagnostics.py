@@ -39,7 +39,6 @@ def diagnostics_of(
 
     Parameters
     ----------
-    fit : Personalised
     gate : bool, optional
         Whether its valve passed the gate; None if untested.
     unlike : str

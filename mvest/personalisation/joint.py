@@ -30,26 +30,13 @@ AS_PREDICTED = 0.75
 
 @dataclass(frozen=True)
 class JointPosterior:
-    """Posterior of parameters m and geometry modes, with all other errors marginalised.
+    """Posterior of parameters m and geometry modes, with all other errors marginalised."""
 
-    Attributes
-    ----------
-    prior : Gaussian
-        Of the parameters in filter coordinates z.
-    transform : Transform
-    observation : Observed
-        As measured.
-    errors : FrameErrors
-        With linearised effects of the geometry.
-    learned : LearnedNoise or None
-        None: errors as stated.
-    """
-
-    prior: Gaussian
+    prior: Gaussian  #: of the parameters in filter coordinates z
     transform: Transform
-    observation: Observed
-    errors: FrameErrors
-    learned: LearnedNoise | None
+    observation: Observed  #: as measured
+    errors: FrameErrors  #: with linearised effects of the geometry
+    learned: LearnedNoise | None  #: None: errors as stated
 
     @cached_property
     def noise(self) -> ObservationNoise:

@@ -49,26 +49,13 @@ UNITS = {
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """The observation to first order about a closed valve.
+    """The observation to first order about a closed valve."""
 
-    Attributes
-    ----------
-    names : tuple of str, (p,)
-        Of the unknowns.
-    prior : (p, p)
-        Covariance of the unknowns, in filter coordinates.
-    H : (k, p)
-        Derivatives of the observation in these.
-    errors : FrameErrors
-    learned : LearnedNoise or None
-        None: errors as stated.
-    """
-
-    names: tuple[str, ...]
-    prior: FloatArray
-    H: FloatArray
+    names: tuple[str, ...]  #: (p,), of the unknowns
+    prior: FloatArray  #: (p, p), covariance of the unknowns, in filter coordinates
+    H: FloatArray  #: (k, p), derivatives of the observation in these
     errors: FrameErrors
-    learned: LearnedNoise | None = None
+    learned: LearnedNoise | None = None  #: None: errors as stated
 
     @classmethod
     def of(cls, filtered: Estimate, errors: FrameErrors) -> LinearModel:

@@ -64,7 +64,6 @@ def record_of_case(
 
     Parameters
     ----------
-    fit : Personalised
     gate : bool, optional
         Whether its anatomy passed the gate; None if untested.
     images : mapping, optional

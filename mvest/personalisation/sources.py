@@ -48,24 +48,14 @@ TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorSource:
-    """One uncertain property of the valve: independent modes of one standard deviation each.
+    """One uncertain property of the valve: independent modes of one standard deviation each."""
 
-    Attributes
-    ----------
-    columns : ErrorColumns
-        Effect of the modes on the observation, reduced to what noise does not hide.
-    rows : (k, q)
-        Effect of every mode.
-    moves : (f, n, 3, q) mm
-        Effect of every mode on the observed valve, the open frame first.
-    modes : GeometryModes or None
-        Of a geometry; None for law and mesh.
-    """
-
+    #: Effect of the modes on the observation, reduced to what noise does not hide.
     columns: ErrorColumns
-    rows: FloatArray
+    rows: FloatArray  #: (k, q), effect of every mode
+    #: (f, n, 3, q) mm, effect of every mode on the observed valve, the open frame first.
     moves: FloatArray
-    modes: GeometryModes | None = None
+    modes: GeometryModes | None = None  #: of a geometry; None for law and mesh
 
     @property
     def name(self) -> str:
@@ -75,21 +65,11 @@ class ErrorSource:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosedValve:
-    """A closed valve at which errors are linearised.
+    """A closed valve at which errors are linearised."""
 
-    Attributes
-    ----------
-    registered : RegisteredModel
-        Its last closed state is the starting state.
-    m : (p,)
-        Parameters of the closed valve.
-    predicted : array
-        All its frames, stacked.
-    """
-
-    registered: RegisteredModel
-    m: FloatArray
-    predicted: FloatArray
+    registered: RegisteredModel  #: its last closed state is the starting state
+    m: FloatArray  #: (p,), parameters of the closed valve
+    predicted: FloatArray  #: all its frames, stacked
 
     def closure(self) -> tuple[ClosureModel, FloatArray, list[HeldState]]:
         """The closure, its parameters, and the loads of further frames."""
@@ -122,8 +102,6 @@ def geometry_sources(
 
     Parameters
     ----------
-    modes : sequence of GeometryModes
-    valve : ClosedValve
     observation : Observed
         Of the case.
     noise : ObservationNoise
@@ -259,19 +237,11 @@ def of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSamples:
-    """Samples of the change of a prediction by measurement errors of the frames it is built from.
+    """Samples of the change of a prediction by errors of the frames it is built from."""
 
-    Attributes
-    ----------
-    predicted : (K, n, 3) mm
-        Displacement of the predicted closed valve.
-    seen, opened : (K, n, 3) mm
-        Displacement of the observed closed and of the open frame in the same samples.
-    """
-
-    predicted: FloatArray
-    seen: FloatArray
-    opened: FloatArray
+    predicted: FloatArray  #: (K, n, 3) mm, displacement of the predicted closed valve
+    seen: FloatArray  #: (K, n, 3) mm, displacement of the observed closed frame
+    opened: FloatArray  #: (K, n, 3) mm, displacement of the open frame
 
     def __len__(self) -> int:
         return len(self.seen)

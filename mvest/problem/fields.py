@@ -35,52 +35,29 @@ TYPES: Mapping[str, type] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseFields:
-    """A valve at rest, with its observed and predicted shapes in ``f`` further frames.
+    """A valve at rest, with its observed and predicted shapes in ``f`` further frames."""
 
-    Attributes
-    ----------
-    triangles : (m, 3)
-    region : (m,)
-        Leaflet of each triangle.
-    rest : (n, 3) mm
-        The open valve in the reference frame.
-    annulus, free_edge : (k,)
-        Vertices in loop order.
-    seen : (f,)
-        Whether the filter received a frame.
-    tips : (f + 1, t, 3) mm
-        Papillary tips, in the reference frame first.
-    chord_tip, chord_insertion : (c,)
-        Tip and vertex of each chord.
-    frames : tuple of str
-        ``f`` names, without the reference frame.
-    observed, generic, fitted : ndarray or None
-        ``(f, n, 3)`` mm; NaN for unobserved vertices.
-    observed_points : mapping
-        ``(q, 3)`` mm for a frame without correspondence to the reference frame.
-    distance_generic, distance_fitted : ndarray or None
-        ``(f, n)`` mm from the observation; NaN for unobserved vertices.
-    reach_mm : float or None
-        Distance of midsurfaces below which leaflets touch.
-    """
-
-    triangles: IntArray
-    region: IntArray
-    rest: FloatArray
-    annulus: IntArray
-    frames: tuple[str, ...]
-    seen: BoolArray
-    tips: FloatArray
+    triangles: IntArray  #: (m, 3)
+    region: IntArray  #: (m,), leaflet of each triangle
+    rest: FloatArray  #: (n, 3) mm, the open valve in the reference frame
+    annulus: IntArray  #: (k,), vertices in loop order
+    frames: tuple[str, ...]  #: ``f`` names, without the reference frame
+    seen: BoolArray  #: (f,), whether the filter received a frame
+    tips: FloatArray  #: (f + 1, t, 3) mm, papillary tips, in the reference frame first
+    #: ``(q, 3)`` mm for a frame without correspondence to the reference frame.
     observed_points: Mapping[str, FloatArray]
-    free_edge: IntArray = field(default_factory=lambda: NO_INDEX)
+    free_edge: IntArray = field(default_factory=lambda: NO_INDEX)  #: (k,), vertices in loop order
+    #: (c,), tip and vertex of each chord.
     chord_tip: IntArray = field(default_factory=lambda: NO_INDEX)
+    #: (c,), tip and vertex of each chord.
     chord_insertion: IntArray = field(default_factory=lambda: NO_INDEX)
-    observed: FloatArray | None = None
-    generic: FloatArray | None = None
-    fitted: FloatArray | None = None
+    observed: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
+    generic: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
+    fitted: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
+    #: ``(f, n)`` mm from the observation; NaN for unobserved vertices.
     distance_generic: FloatArray | None = None
     distance_fitted: FloatArray | None = None
-    reach_mm: float | None = None
+    reach_mm: float | None = None  #: distance of midsurfaces below which leaflets touch
 
     @property
     def closed(self) -> int:

@@ -62,19 +62,11 @@ def entry_of(
 
 @dataclass(frozen=True, slots=True)
 class StoredModel:
-    """A model with a disk cache of its converged predictions, without derivatives.
-
-    Attributes
-    ----------
-    model : ObservationModel
-    folder : Path
-    key : str
-        From :func:`key_of`; the parameters are added to it.
-    """
+    """A model with a disk cache of its converged predictions, without derivatives."""
 
     model: ObservationModel
     folder: Path
-    key: str
+    key: str  #: from :func:`key_of`; the parameters are added to it
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Prediction at ``m (p,)``; its Jacobian is zero if it was read from disk.
@@ -103,17 +95,11 @@ class Extrapolated:
 
     Richardson 1911, Phil. Trans. R. Soc. A 210:307. Closed valves of quadratic tetrahedra converge
     with nearly order one: leaflets bend sharply at contact, and chordae and annulus pull at lines.
-
-    Attributes
-    ----------
-    fine, coarse : StoredModel
-    share : float
-        Cell size of the fine mesh over that of the coarse one.
     """
 
     fine: StoredModel
     coarse: StoredModel
-    share: float
+    share: float  #: cell size of the fine mesh over that of the coarse one
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Prediction at ``m (p,)``, without derivatives."""

@@ -73,12 +73,8 @@ class ImagedSettings:
     pressure_curve: str | None = None  #: .csv of time,pressure (s, mmHg) instead
     thickness_mm: tuple[Thickness, ...] = ()  #: of the LEAFLETS; empty: generic
     min_confidence: Share = MIN_CONFIDENCE  #: of the best frame, and of the frames that are chosen
-    error_samples: Count = (
-        200  # largest number taken from held-out volumes; mirrored ones are added
-    )
-    name: str | None = (
-        None  # None: made of the file's content, since files are named after patients
-    )
+    error_samples: Count = 200  #: at most, from held-out volumes; mirror images are added
+    name: str | None = None  #: None: made of the file's content, as files are named after patients
     description: str = ""
     source: str = ""
     licence: str = ""
@@ -221,8 +217,6 @@ def detect_in_volume(
 
     Parameters
     ----------
-    file : Path
-    settings : ImagedSettings, optional
     estimate : bool
         Whether the case will be estimated, so that a pressure is required.
     progress : callable, optional
@@ -239,9 +233,8 @@ def detect_in_volume(
     # Settings are checked before anything that takes long.
     pressure: Any = settings.pressure_mmHg
     if settings.pressure_curve is not None:
-        pressure = pressure_curve(
-            *read_numbers(Path(settings.pressure_curve), ("time", "pressure")).T
-        )
+        points = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
+        pressure = pressure_curve(*points.T)
     elif estimate and pressure is None:
         raise InputError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
