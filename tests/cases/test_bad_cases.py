@@ -115,18 +115,6 @@ def twice(x, t, r):
     return np.vstack([x, x + 60.0]), np.vstack([t, t + len(x)]), np.append(r, r)
 
 
-def disconnected(folder, document):
-    lines = (folder / "chordae.csv").read_text().splitlines()
-    cells = lines[4].split(",")
-    lines[4] = ",".join([*cells[:3], "40", *cells[4:]])
-    (folder / "chordae.csv").write_text("\n".join(lines))
-
-
-def link_out(folder, document):
-    shutil.copy(folder / "open.vtp", folder.parent / "elsewhere.vtp")
-    (folder / "link.vtp").symlink_to(folder.parent / "elsewhere.vtp")
-
-
 POINTS = "x,y,z\n1,2,3\n4,5,6\n7,8,9\n"
 TIPS = "frames.{}.papillary_tips".format
 THREE = [[16.0, 0, -25], [-16.0, 0, -25], [0.0, 0, -25]]
@@ -217,7 +205,6 @@ CASES = {
     "no such point data": (
         put("thickness", {"point_data": "depth"}), "thickness", "no point data 'depth'; found none"
     ),
-    "chord disconnected": (disconnected, "chordae", r"chord 3 is disconnected.* mm from"),
     "unknown family": (
         put("chordae", {"file": "chordae.csv", "families": ["marginal"]}),
         "chordae", "'basal'; known are marginal",
@@ -230,9 +217,6 @@ CASES = {
     "missing file": (put("frames.0.surface", "opne.vtp"), OPEN, "'opne.vtp': no such file in"),
     "path out of the folder": (
         put("frames.0.surface", "../case/open.vtp"), OPEN, "leads out of the folder"
-    ),
-    "link out of the folder": (
-        both(link_out, put("frames.0.surface", "link.vtp")), OPEN, "leads out of the folder"
     ),
     # The document.
     "unknown version": (put("version", 2), "version", "2 is not known; expected 1"),

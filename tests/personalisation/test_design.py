@@ -101,11 +101,3 @@ def test_errors_of_the_geometry_are_common_to_all_frames(designs, monkeypatch):
 def test_a_valve_that_does_not_close_has_no_designs(monkeypatch):
     use(monkeypatch, fails_above=1.0)
     assert "no equilibrium" in design_case(CASE, settings(pressures=STATED))
-
-
-def test_without_an_unknown_pressure_its_errors_do_not_count(monkeypatch):
-    use(monkeypatch)
-    moduli = tuple(u for u in unknowns() if u.name.startswith("E_f."))
-    found = design_case(CASE, settings(*moduli))
-    assert set(found.knowledge) == {u.name for u in moduli}
-    assert found.left(2, {"factor": 0.5, "offset": 9.0, "each": 9.0}) == found.left(2)

@@ -90,14 +90,6 @@ def test_equal_frames_with_independent_errors_are_one_with_less_variance(monkeyp
     np.testing.assert_allclose(a.filtered.covariance, b.filtered.covariance, rtol=1e-6, atol=1e-10)
 
 
-def test_with_one_frame_errors_of_pressures_add_no_unknown(monkeypatch):
-    use(monkeypatch)
-    plain = personalise(made_up_case(), settings())
-    same = personalise(made_up_case(), settings(pressures=PRESSURES))
-    assert same.result.parameters == plain.result.parameters
-    np.testing.assert_array_equal(same.result.estimate, plain.result.estimate)
-
-
 def test_errors_of_each_frame_are_learned(monkeypatch):
     use(monkeypatch)
     rng = np.random.default_rng(5)

@@ -8,13 +8,10 @@ import pytest
 
 from mvest.cases.case import Role
 from mvest.cases.tissue import SEEN_ON_BAND, LeafletBand, lay_out_chordae
-from mvest.closure.frames import FramesModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
 from mvest.estimation.noise import observation_noise
-from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
-from mvest.personalisation import personalise
 from mvest.personalisation.geometry import (
     GeometryModes,
     NuisanceGeometry,
@@ -25,24 +22,15 @@ from mvest.personalisation.geometry import (
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalisation.model import CaseClosure, contact_annulus
+from mvest.personalisation.model import contact_annulus
 from mvest.personalisation.sources import ClosedValve, geometry_sources, sample_frames
 from mvest.problem.registration import RegisteredModel
 from tests.cases.test_uncertainty import corresponding
 from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, model_of
-from tests.made_up_closure import (
-    FIELDS,
-    error_source,
-    made_up_case,
-    settings,
-    use,
-)
 
-MODE = GeometryModes("open shape", {"shape": np.ones((1, 1))})
 NONE = NuisanceGeometry(
     shape_mm=0, annulus_mm=0, tips_mm=0, insertions_mm=0, thickness=0, fibre_degrees=0
 )
-MODULI = ("E_f.anterior", "E_f.posterior")
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -125,17 +113,6 @@ def test_a_scale_of_a_leaflet_lengthens_it_and_leaves_the_other_and_the_annulus(
             assert after / before - 1.0 == pytest.approx(0.04 * (x == k), abs=0.006)
 
 
-def test_scales_of_annulus_and_of_all_lengths():
-    model = model_of(GENTLE, **SMALL)
-    case = case_of(model)
-    (annulus,) = geometry_modes(case, replace(NONE, annulus_scale=0.02), model)
-    closed = model.contact_valve.motion.annulus[-1]
-    np.testing.assert_allclose(annulus.parts["annulus"][0], 0.02 * (closed - closed.mean(axis=0)))
-    # A larger and equally thicker valve has the same shape under the same pressure.
-    (whole,) = geometry_modes(case, replace(NONE, frame_scale=0.02), model)
-    np.testing.assert_allclose(whole.parts["thickness"], 0.02)
-
-
 def laid_out(case, tips=0.0, open_move=0.0, closed_move=0.0):
     """The chordae, laid out for displaced tips and leaflets."""
     surface, closed = case.surface, case.frame(Role.CLOSED)
@@ -195,54 +172,6 @@ def test_rest_lengths_change_as_chordae_laid_out_on_other_frames(lift):
 
     expected = (distance(1e-4) - distance(-1e-4)) / (2e-4 * distance(0.0))
     np.testing.assert_allclose(rest_lengths_by_tips(case, move)[0], expected, atol=1e-7)
-
-
-def test_uncertain_geometry_widens_the_intervals(monkeypatch):
-    use(monkeypatch)
-    case = made_up_case(0.3, 8.0, np.random.default_rng(1))
-    where = []
-
-    def sources(modes, valve, observation, noise, seen):
-        # As if the anterior belly were uncertain by 0.2 mm.
-        where.append(valve.m)
-        return (error_source(0.2 * FIELDS["E_f.anterior"].reshape(-1, 1), MODE),)
-
-    monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", sources)
-    known = personalise(case, settings())
-    wider = personalise(case, settings(nuisance_geometry=NuisanceGeometry()))
-    anterior = wider.result.parameters.index("E_f.anterior")
-    assert wider.result.std[anterior] > 1.3 * known.result.std[anterior]
-    shares = {row["source"]: row["share"] for row in wider.details["shares"][::2]}
-    assert shares["open shape"] > 0.3
-    # Averaging does not reduce errors of the geometry.
-    averaged = [
-        next(row["std_if_known"] for row in fit.details["narrower"] if "mean of 4" in row["what"])
-        for fit in (known, wider)
-    ]
-    assert averaged[1] > 1.5 * averaged[0]
-    # Linearised once, about an estimate without these errors.
-    assert len(where) == 1
-    np.testing.assert_allclose(where[0], known.result.estimate, rtol=0.05, atol=0.2)
-
-
-def test_all_closed_frames_are_displaced_as_their_derivatives_say():
-    model = model_of(GENTLE, **SMALL)
-    motion = model.contact_valve.motion
-    state = HeldState(0.3, motion.annulus[-1], motion.papillary_tips[-1])
-    frames = FramesModel(model, "closed", {"early": state}, 1.0)
-    closure = CaseClosure.of(model, frames, model.names, AT)
-    rng = np.random.default_rng(2)
-    parts = {
-        "annulus": np.broadcast_to(rng.normal(0.0, 0.02, 3), motion.annulus[-1].shape),
-        "tips": rng.normal(0.0, 0.02, motion.papillary_tips[-1].shape),
-    }
-    displaced, still = closure.displaced(parts, AT).shared(AT), closure.shared(AT)
-    geometry = RestGeometry(model)
-    variation = geometry.variation({name: move[None] for name, move in parts.items()})
-    change = geometry.change(AT, variation, [state])[..., 0]
-    moved = (displaced.y - still.y).reshape(change.shape)
-    assert np.abs(change[1]).max() > 0.01
-    np.testing.assert_allclose(moved, change, atol=0.02 * np.abs(change).max())
 
 
 def test_columns_of_a_displaced_valve_are_by_the_errors_that_displaced_it():

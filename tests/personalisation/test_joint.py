@@ -182,7 +182,7 @@ def steps(monkeypatch):
     return taken
 
 
-@pytest.mark.parametrize("curve", [1.0, 6.0, 100.0])
+@pytest.mark.parametrize("curve", [1.0, 100.0])
 def test_relinearisation_ends_at_the_joint_mode_of_moduli_and_geometry(monkeypatch, steps, curve):
     case, known = bent_case(monkeypatch, curve)
     seen = case.frame(Role.CLOSED).vertices.ravel()

@@ -153,25 +153,6 @@ def seen_again(patient, rng, **simulation):
     return virtual_patient._case("small", "d", seen, true, settings, MECHANICS, rng)
 
 
-def test_errors_have_the_size_and_the_reach_that_the_case_states(patient):
-    rng, errors = np.random.default_rng(4), []
-    for _ in range(60):
-        case = seen_again(patient, rng)
-        errors.append([f.vertices - patient.positions[f.name] for f in case.frames[1:]])
-    errors = np.array(errors)
-    assert errors.std() == pytest.approx(0.4, rel=0.05)
-    # Frames and coordinates are independent of each other.
-    flat = errors.transpose(0, 2, 1, 3).reshape(-1, 6)
-    assert np.abs(np.corrcoef(flat.T) - np.eye(6)).max() < 0.15
-    # Neighbours are correlated, vertices of other sides are not.
-    pair = errors[:, :, [0, 1, 16], :].reshape(60, 2, 3, 3)
-    alike = [np.mean(pair[:, :, 0] * pair[:, :, k]) / 0.16 for k in (1, 2)]
-    points = case.surface.vertices
-    assert np.linalg.norm(points[0] - points[1]) < 8.0 < np.linalg.norm(points[0] - points[16]) / 3
-    assert alike[0] > 0.5
-    assert abs(alike[1]) < 0.2
-
-
 def test_rough_errors_come_on_top_and_are_not_stated(patient):
     case = seen_again(patient, 3, rough_std_mm=0.3)
     assert case.uncertainty.std_mm == SMALL.std_mm

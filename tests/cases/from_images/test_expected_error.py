@@ -44,15 +44,6 @@ def test_a_mirror_swaps_sides_and_is_undone_by_itself():
     np.testing.assert_array_equal(there[-1], [-4.0, 5.0, 6.0])
 
 
-def test_an_error_that_follows_the_shape_is_known_of_one_more_valve():
-    # Penalties that are all too large; even and odd mixed up; a mean that is left out or doubled.
-    shapes, errors, _ = made_up(1, 41, noise=1e-3, law=1.0)
-    expected, samples = error_at_shape(SMALL, errors[1:], shapes[1:], shapes[0])
-    assert errors[1:].std() > 1.0
-    assert np.abs(expected - errors[0]).max() < 0.05
-    assert samples.std() < 0.05
-
-
 def test_what_is_stated_covers_the_errors_of_further_valves():
     shapes, errors, _ = made_up(3, 60, noise=1.0, law=0.5)
     n, own = SMALL.size, slice(0, 40)
