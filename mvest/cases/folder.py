@@ -163,18 +163,9 @@ def write_case(folder: Path | str, case: ValveCase) -> Path:
 
     Everything is stated explicitly, in mm, s and mmHg, so that nothing is derived on reading. The
     folder must be new or empty, and appears only when it is complete. It is returned. InputError if
-    it is not empty or cannot be written, or the reference frame differs from the case's surface.
+    it is not empty or cannot be written.
     """
     target = require_new(folder)
-    frame, surface = case.frame(Role.REFERENCE), case.surface
-    own = {name: getattr(surface, name) for name in ("vertices", "triangles", "region")}
-    own |= {name: surface.vertices[getattr(case, name)] for name in LOOPS}
-    for name, wanted in own.items():
-        if not np.array_equal(getattr(frame, name), wanted):
-            raise InputError(
-                f"case {case.name}: {name} of the reference frame {frame.name!r} differs from the "
-                "surface's"
-            )
     return write_atomically(target, lambda part: _write_files(part, case))
 
 

@@ -115,14 +115,9 @@ class CaseProblem:
         on_iterate: OnIterate | None = None,
         model: ClosureModel | None = None,
     ) -> CaseProblem:
-        """The problem of a case.
+        """The problem of a case; the parameters are those of `personalise`.
 
-        Parameters
-        ----------
-        store, on_step, on_iterate
-            As of `personalise`.
-        model : ClosureModel, optional
-            From `build_model`, possibly closed already.
+        ``model`` comes from `build_model` and may have been closed.
 
         Raises
         ------
@@ -247,12 +242,8 @@ def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstim
     """Estimate all unknowns, with the errors of geometry and law.
 
     The effects of these errors depend on the moduli: at half the modulus, derivatives are off by a
-    quarter. So a rough estimate without them gives the first linearisation point.
-
-    Parameters
-    ----------
-    generic : LinearisationPoint
-        With the effect of error samples, if the case has any.
+    quarter. So a rough estimate without them gives the first linearisation point. The generic valve
+    has the effect of the error samples of its case, if there are any.
     """
     settings = problem.settings
     if settings.nuisance_geometry is None and not settings.nuisance_law:

@@ -33,7 +33,7 @@ REACH = 1.959963984540054
 """Standard deviations from the mean of a normal distribution to the ends of its 95 % interval."""
 
 IMAGES, SINGLE = "errors of the images", "errors of single points"
-DOUBT, MODULI = "size of the errors", "prior of the moduli"
+SIZE, MODULI = "size of the errors", "prior of the moduli"
 """Sources of variance besides the unknowns and the errors of geometry and law."""
 
 STEP = 1e-3
@@ -190,7 +190,7 @@ class LinearModel:
         if self._sampled is not None:
             parts[IMAGES] = np.diag(self._sampled.from_samples)
         if self.learned is not None:
-            parts[DOUBT] = np.diag(self.learned.covariance)
+            parts[SIZE] = np.diag(self.learned.covariance)
         return parts
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mvest.cases.case import ValveCase
 from mvest.closure.frames import ERROR, OFFSET, is_frame_pressure
-from mvest.errors import InputError, require_numbers
+from mvest.errors import InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings, TissueSettings
@@ -79,9 +79,6 @@ class PressureErrors:
     #: Standard deviation of the independent error of each frame, for example on a steep part of the
     #: pressure curve; 0: none.
     each_mmHg: PressureError = 5.0
-
-    def __post_init__(self) -> None:
-        require_numbers(self, "pressures", "offset_mmHg", "each_mmHg", least=0)
 
     def unknowns(self, frames: Iterable[str]) -> tuple[Prior, ...]:
         """The unknown errors of the pressures of these frames."""

@@ -6,8 +6,8 @@ equals estimating the modes with the parameters and reporting the parameters alo
 
 Error samples of a case are complete valves with other open shape, annulus, papillary tips and
 chordae. The linear change of the predicted closed valve (`mvest.closure.rest_geometry`) minus the
-change of its closed frame is one sample of the error of the innovation. Common errors of both
-frames cancel as far as they move the valve as a whole.
+change of its closed frame is one sample of the error of the innovation. Errors that
+move both frames as a whole cancel.
 """
 
 from __future__ import annotations

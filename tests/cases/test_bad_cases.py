@@ -93,18 +93,6 @@ def hole(x, t, r):
     return np.delete(x, 84, axis=0), t - (t > 84), r
 
 
-def handle(x, t, r):
-    """A tube between two triangles, both of which are taken away."""
-    a, b = t[60], t[75][[0, 2, 1]]
-    tube = [
-        corners
-        for i, j in ((0, 1), (1, 2), (2, 0))
-        for corners in ([a[i], a[j], b[i]], [a[j], b[j], b[i]])
-    ]
-    x, t, r = without(np.isin(np.arange(len(t)), (60, 75)), x, t, r)
-    return x, np.vstack([t, tube]), np.append(r, [0] * 6)
-
-
 def crossed(x, t, r):
     """One vertex of a leaflet is pushed through the other side of the valve."""
     x[156] += 1.3 * (x[168] - x[156]) + np.array([0.0, 0.0, 0.1])
@@ -129,7 +117,6 @@ CASES = {
         surface(lambda x, t, r: (x, t[:, ::-1], r)), OPEN, "flipped normals.*reverse every triangle"
     ),
     "two pieces": (surface(twice), OPEN, r"2 pieces that do not touch \(192, 192 vertices\)"),
-    "handle": (surface(handle, "closed"), CLOSED, "Euler number -2, expected 0: .* has 1 handle"),
     "unused vertex": (
         surface(lambda x, t, r: (np.vstack([x, x[:1]]), t, r)), OPEN, r"vertices \[192\]"
     ),

@@ -125,8 +125,6 @@ def test_the_registered_valve_is_the_rigid_motion_of_least_squares():
     generic, registered = closed["generic"], closed["registered"]
     gaps = [np.linalg.norm(x[:, None] - x[None], axis=2) for x in (generic, registered)]
     np.testing.assert_allclose(gaps[0], gaps[1], atol=1e-9)
-    edges = [np.diff(x[[0, 1, 40, 90]], axis=0) for x in (generic, registered)]
-    assert np.linalg.det(edges[0]) == pytest.approx(np.linalg.det(edges[1]))
     # Least squares: no mean error and no mean moment is left.
     error, arm = seen - registered, registered - registered.mean(axis=0)
     np.testing.assert_allclose(error.mean(axis=0), 0, atol=1e-9)
@@ -239,7 +237,6 @@ def test_inadmissible_priors_are_refused():
     ("given", "message"),
     [
         (unknowns()[:1], "has the leaflets anterior, posterior"),
-        ((*unknowns()[:2], Prior("E_f.septal", 1.0, 0.5)), "has the leaflets anterior, posterior"),
         ((*unknowns()[:2], Prior("chord_stiffness.tip9", 1.0, 0.5)), "tip9"),
     ],
 )

@@ -98,25 +98,12 @@ def test_a_failing_truth_is_a_value_with_its_reason():
     assert result.estimate is result.std is result.distance is None
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"noise_mm": -1.0}, "noise std = -1.0"),
-        ({"frames": ("shut",)}, "shut"),
-        ({"variance": 0.0}, "R is 0"),
-    ],
-)
-def test_bad_input_is_refused(change: dict, words: str):
-    with pytest.raises(InputError, match=words):
-        observe(**change)
-
-
 def test_bad_values_and_shapes_are_refused():
     rng = np.random.default_rng(1)
+    with pytest.raises(InputError, match="shut"):
+        observe(frames=("shut",))
     with pytest.raises(InputError, match="1 true values for the 2 parameters"):
         simulate_observation(Sheet(), NAMES, np.array([1.0]), variance=1.0, rng=rng)
-    with pytest.raises(MaterialError, match="expected > 0"):
-        simulate_observation(Sheet(), NAMES, np.array([-1.0, 1.0]), variance=1.0, rng=rng)
     with pytest.raises(InputError, match="prior has 1"):
         dataclasses.replace(case(), prior=Gaussian.from_variance(np.ones(1), 1.0))
     data = observe()

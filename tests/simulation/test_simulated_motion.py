@@ -132,13 +132,6 @@ def test_what_no_valve_does_is_refused(limits, vertices, words):
         motion.check_motion(still(vertices=vertices), 1, motion.MotionLimits(**limits))
 
 
-def test_what_a_valve_may_do_passes(valve):
-    motion.check_motion(valve, 4, motion.MotionLimits())
-    motion.check_motion(
-        still(vertices=1.5 * REST), 1, motion.MotionLimits(orifice=5.0, edge_gap=50.0)
-    )
-
-
 # --- populations --------------------------------------------------------------------------------
 
 BASES = {
