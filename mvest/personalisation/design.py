@@ -36,10 +36,7 @@ def expect_case(
 ) -> Expected:
     """Expected precision of an estimate of a case, to first order about the generic valve.
 
-    Parameters
-    ----------
-    model : ClosureModel, optional
-        The closure of the case; default: on the guide mesh.
+    The default model is the closure on the guide mesh.
     """
     model = build_coarse(case, settings) if model is None else model
     problem = CaseProblem.of(case, settings, model=model)
@@ -113,12 +110,8 @@ class FrameDesigns:
     ) -> dict[str, float]:
         """Posterior standard deviation of each unknown from ``count`` frames.
 
-        Parameters
-        ----------
-        errors : mapping, optional
-            Of the pressures; default: as stated.
-        known : tuple of str
-            Further unknowns that are known exactly, by the first part of their names.
+        By default the errors of the pressures are those stated. ``known`` are further unknowns that
+        are known exactly, by the first part of their names.
         """
         errors, members = errors or self.stated, self.chosen(count)
         pressures = {SCALE: errors["factor"], OFFSET: errors["offset"]}

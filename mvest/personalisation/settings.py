@@ -225,12 +225,8 @@ CURVES = {
 def default_settings(case: ValveCase) -> PersonaliseSettings:
     """Settings that suit the source of a case: surfaces, or a volume with error samples.
 
-    Moduli are in MPa, displacements in mm and degrees.
-
-    Parameters
-    ----------
-    case : ValveCase
-        With an anterior and a posterior leaflet.
+    Moduli are in MPa, displacements in mm and degrees. The case must have an anterior and a
+    posterior leaflet.
     """
     # Leaflets, annulus and tips of one volume are not displaced against each other, and the error
     # samples contain their errors.

@@ -141,14 +141,8 @@ def law_and_mesh_sources(
     tissue between both laws. The error of the mesh has a share of its difference from the guide
     mesh, if there is one, as standard deviation.
 
-    Parameters
-    ----------
-    tissue : mapping
-        Region -> exponential tissue; only the shape of its curve counts.
-    mesh_share : float
-        0: without mesh errors.
-    valve, observation
-        As of `geometry_sources`.
+    ``tissue`` maps regions to exponential tissues, of which only the shape of the curve counts;
+    ``mesh_share`` 0 leaves mesh errors out.
     """
     model, at, states = valve.closure()
     coarse = model.guide or model
@@ -183,20 +177,10 @@ def law_change(
 ) -> FloatArray | str:
     """Change ``(f, n, 3, q)`` mm of the observed valve by another law, or the reason for failure.
 
-    The frames are the open valve, which stays, the states, and the closed valve.
-
-    Parameters
-    ----------
-    model : ClosureModel
-        On a coarse mesh: closing a fine one without a guide takes as long as an estimation.
-    m : (p,)
-        Parameters of the closure.
-    states : sequence of HeldState
-        Under other loads, reached from the closed valve.
-    tissue : mapping
-        As for `law_and_mesh_sources`.
-    first : sequence of Simulation
-        Closed valve and states with the linear law.
+    The frames are the open valve, which stays, the states (other loads, reached from the closed
+    valve), and the closed valve. The mesh should be coarse: closing a fine one without a guide
+    takes as long as an estimation. ``m (p,)`` are the parameters of the closure, ``first`` closed
+    valve and states with the linear law.
     """
     at = np.asarray(m, dtype=np.float64)
     values = {**model.fixed, **dict(zip(model.names, map(float, at), strict=True))}

@@ -191,12 +191,9 @@ class EstimateRecord(Frozen):
         return self.model_copy(update={**nothing, "details": details, "alternatives": others})
 
     def with_truth(self, truth: Mapping[str, float]) -> EstimateRecord:
-        """A copy with true values, also for derived moduli and the alternatives.
+        """A copy with true values by name, also for derived moduli and the alternatives.
 
-        Parameters
-        ----------
-        truth : mapping
-            Name -> value; unknowns without an entry stay as they are.
+        Unknowns without an entry stay as they are.
         """
         known = dict(truth)
         for unknown in self.unknowns:

@@ -44,18 +44,9 @@ def entry_of(
 ) -> Entry[T]:
     """The cache entry of what ``made_by`` makes from ``described``.
 
-    Parameters
-    ----------
-    folder : Path
-        Created with the first entry.
-    described : mapping
-        Plain values: everything that decides the content, except the code.
-    made_by : tuple
-        Modules, functions or classes that make and write it; their imports count too.
-    read : callable
-        Reads a path, or refuses it.
-    name : str
-        Of the file or folder, with ``{key}``.
+    ``described`` holds plain values: everything that decides the content, except the code. That is
+    ``made_by``: modules, functions or classes, with their imports. ``read`` reads a path or refuses
+    it. ``name`` is that of the file or folder; the folder is created with the first entry.
     """
     return Entry(folder / name.format(key=key_of(described, made_by)), read)
 

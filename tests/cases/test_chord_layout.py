@@ -105,8 +105,6 @@ def test_frames_without_correspondence_are_matched(tmp_path):
     save_frames(tmp_path, columns=56, rows=14, names=["closed"])
     case = read_case(save(tmp_path, document))
     assert not case.frames[1].corresponds
-    assert sum("annulus of frame 'closed'" in sentence for sentence in case.derived) == 1
-    assert sum("material coordinates" in sentence for sentence in case.derived) == 1
     # The motion shrinks x by 1 % and y by 6 %, so shares of arc length are not quite material: two
     # halves of an arc L that shrink differently by e move its middle by e L / 4, and the
     # posterior arc is 62 mm long. A vertex is 2.5 mm from its neighbours.
@@ -117,7 +115,6 @@ def test_frames_without_correspondence_are_matched(tmp_path):
     np.testing.assert_allclose(
         case.chordae.rest_length, expected.chordae.rest_length, atol=0.056 * 62 / 4
     )
-    assert case.valve.motion.annulus.shape == (2, 40, 3)
 
 
 @pytest.fixture
@@ -130,7 +127,6 @@ def test_an_open_frame_alone_comes_back_as_it_was_written(tmp_path, anatomy):
     back = read_case(write_case(tmp_path / "case", anatomy))
     assert_equal(back, anatomy, "sha256")
     assert back.closed is None
-    assert str(back).splitlines()[2] == "frames: open (reference, -0.333 mmHg)"
     # Its boundary stays where it is.
     motion = back.valve.motion
     for positions in (motion.annulus, motion.papillary_tips):

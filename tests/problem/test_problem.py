@@ -96,6 +96,10 @@ def test_a_failing_truth_is_a_value_with_its_reason():
     result = StudyResult.failed(case(), data.reason)
     assert not result.converged
     assert result.estimate is result.std is result.distance is None
+    assert str(result) == f"no estimate: {data.reason}"
+    failed = estimate(case(failing), observe().observation)
+    assert not failed.converged
+    assert "Newton's method did not converge" in str(failed)
 
 
 def test_bad_values_and_shapes_are_refused():
@@ -173,12 +177,3 @@ def test_estimates_from_a_shared_start_do_not_depend_on_each_other():
     ]
     # Without the shared start they do depend on each other.
     assert estimates([0, 1, 2], shared=False)[2] != estimates([2], shared=False)[0]
-
-
-def test_a_result_without_an_estimate_prints_why():
-    assert str(StudyResult.failed(case(), "no frame")) == "no estimate: no frame"
-    failed = estimate(case(failing), observe().observation)
-    assert not failed.converged
-    assert failed.estimate is None
-    assert str(failed).startswith("no estimate: not converged: the model gives no prediction")
-    assert "Newton's method did not converge" in str(failed)

@@ -76,7 +76,6 @@ def test_what_no_shape_tells_varies_about_the_mean_as_one_more_valve_does():
 
 @pytest.mark.parametrize("law", [0.0, 0.3, 2.0])
 def test_samples_are_as_wide_as_the_error_of_one_more_valve(law):
-    # Residuals that were fitted, taken for errors; a width that the shape does not widen.
     square, stated, plain = [], [], []
     for seed in range(40):
         shapes, errors, _ = made_up(seed, 25, noise=1.0, law=law)
@@ -122,9 +121,5 @@ def test_the_expected_error_is_taken_off_in_the_axes_of_the_valve():
         np.testing.assert_array_equal(found.vertices[1], seen.vertices[1])
         _, plain = without_expected_error(seen, FRAMES, replace(known, widening=(1.0, 0.0)))
         np.testing.assert_allclose(about, factor * plain)
-    for wrong, message in (
-        (replace(accuracy, samples=errors[:, :, :5]), "errors of shape"),
-        (replace(accuracy, samples=errors[:1, :, :n]), "errors of 1 valves"),
-    ):
-        with pytest.raises(InputError, match=message):
-            without_expected_error(seen, FRAMES, wrong)
+    with pytest.raises(InputError, match="errors of shape"):
+        without_expected_error(seen, FRAMES, replace(accuracy, samples=errors[:, :, :5]))

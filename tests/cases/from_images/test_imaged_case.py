@@ -96,8 +96,8 @@ def test_frames_are_chosen_by_orifice_and_contact_among_those_that_are_sure():
     # Frames that no one believes in are not chosen, whatever they show.
     unsure = replace(seen, frame_confidence=np.array([0.3, 0.8, 0.85, 0.9]))
     assert choose_frames(unsure, rows, 120.0).open == 1
-    told = choose_frames(seen, rows, 120.0, open_=1, closed=3)
-    assert (told.open, told.closed, told.derived) == (1, 3, ())
+    given = choose_frames(seen, rows, 120.0, open_=1, closed=3)
+    assert (given.open, given.closed, given.derived) == (1, 3, ())
     with pytest.raises(InputError, match=r"0 of 4 frames .*imaged\.open_frame"):
         choose_frames(replace(seen, frame_confidence=np.full(4, 0.2)), rows, 120.0)
     with pytest.raises(InputError, match="closed frame 4, expected one of 0 to 3"):
