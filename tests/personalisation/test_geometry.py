@@ -8,9 +8,11 @@ import pytest
 
 from mvest.cases.case import Role
 from mvest.cases.tissue import SEEN_ON_BAND, LeafletBand, lay_out_chordae
+from mvest.closure.frames import FramesModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
 from mvest.estimation.noise import observation_noise
+from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
 from mvest.personalisation.geometry import (
     GeometryModes,
@@ -22,7 +24,7 @@ from mvest.personalisation.geometry import (
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalisation.model import contact_annulus
+from mvest.personalisation.model import CaseClosure, contact_annulus
 from mvest.personalisation.sources import ClosedValve, geometry_sources, sample_frames
 from mvest.problem.registration import RegisteredModel
 from tests.cases.test_folder import corresponding
@@ -232,3 +234,34 @@ def test_samples_of_frames_move_the_valve_as_a_displaced_geometry_does(monkeypat
 def test_inadmissible_standard_deviations_are_refused(setting, value):
     with pytest.raises(InputError, match=f"nuisance geometry {setting} = "):
         NuisanceGeometry(**{setting: value})
+
+
+def test_scales_of_annulus_and_of_all_lengths():
+    model = model_of(GENTLE, **SMALL)
+    case = case_of(model)
+    (annulus,) = geometry_modes(case, replace(NONE, annulus_scale=0.02), model)
+    closed = model.contact_valve.motion.annulus[-1]
+    np.testing.assert_allclose(annulus.parts["annulus"][0], 0.02 * (closed - closed.mean(axis=0)))
+    # A larger and equally thicker valve has the same shape under the same pressure.
+    (whole,) = geometry_modes(case, replace(NONE, frame_scale=0.02), model)
+    np.testing.assert_allclose(whole.parts["thickness"], 0.02)
+
+
+def test_all_closed_frames_are_displaced_as_their_derivatives_say():
+    model = model_of(GENTLE, **SMALL)
+    motion = model.contact_valve.motion
+    state = HeldState(0.3, motion.annulus[-1], motion.papillary_tips[-1])
+    frames = FramesModel(model, "closed", {"early": state}, 1.0)
+    closure = CaseClosure.of(model, frames, model.names, AT)
+    rng = np.random.default_rng(2)
+    parts = {
+        "annulus": np.broadcast_to(rng.normal(0.0, 0.02, 3), motion.annulus[-1].shape),
+        "tips": rng.normal(0.0, 0.02, motion.papillary_tips[-1].shape),
+    }
+    displaced, still = closure.displaced(parts, AT).shared(AT), closure.shared(AT)
+    geometry = RestGeometry(model)
+    variation = geometry.variation({name: move[None] for name, move in parts.items()})
+    change = geometry.change(AT, variation, [state])[..., 0]
+    moved = (displaced.y - still.y).reshape(change.shape)
+    assert np.abs(change[1]).max() > 0.01
+    np.testing.assert_allclose(moved, change, atol=0.02 * np.abs(change).max())

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mvest.personalisation import PaperSettings, personalise
 from mvest.personalisation.record import arrays_of_case, record_of_case
@@ -109,6 +110,14 @@ def test_arrays_are_those_that_a_report_reads(tmp_path, fit, corresponds):
     assert {"generic", "registered", "fitted"} <= arrays.keys()
     np.savez(tmp_path / "fields.npz", **arrays)
     fields = case_fields(tmp_path / "fields.npz")
+    # The tips lie below the annulus, however the valve lies.
+    for turn in Rotation.random(6, rng=1).as_matrix():
+        turned = {
+            name: values @ turn if values.dtype.kind == "f" and values.ndim > 1 else values
+            for name, values in arrays.items()
+            if not name.startswith("distance")
+        }
+        assert case_fields(turned).tips[..., 2].max() < 0.0
     assert fields.frames == ("closed", "late")
     assert fields.seen.tolist() == [True, False]
     if corresponds:

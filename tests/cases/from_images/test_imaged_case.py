@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
+from mvest.cases.from_images.detected import pressure_curve
 from mvest.cases.from_images.detector_errors import samples_in_world, valve_axes
 from mvest.cases.from_images.measures import measure_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
@@ -160,3 +161,14 @@ def test_frames_pressures_and_thicknesses_out_of_place_are_refused():
         CaseFrames(0, 2, 16.0)
     with pytest.raises(InputError, match="thickness of anterior, expected of anterior, posterior"):
         case_of_sequence(sequence(), FRAMES, TEXTS, thickness_mm={"anterior": 1.3})
+
+
+def test_the_pressure_curve_is_monotone_and_not_extrapolated():
+    time, pressure = np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.0, 5.0, 120.0, 121.0])
+    curve = pressure_curve(time, pressure)
+    np.testing.assert_allclose([curve(t) for t in time], pressure)
+    assert np.all(np.diff([curve(t) for t in np.linspace(0.0, 0.3, 50)]) > 0.0)
+    with pytest.raises(InputError, match=r"time 0.4 s lies outside .* from 0 to 0.3 s"):
+        curve(0.4)
+    with pytest.raises(InputError, match="expected two or more that increase"):
+        pressure_curve(time[::-1], pressure)
