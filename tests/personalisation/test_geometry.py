@@ -227,13 +227,10 @@ def test_samples_of_frames_move_the_valve_as_a_displaced_geometry_does(monkeypat
     np.testing.assert_array_equal(found.opened[0], shape_)
 
 
-@pytest.mark.parametrize(
-    ("setting", "value"),
-    [("shape_mm", -0.1), ("share", 1.0)],
-)
-def test_inadmissible_standard_deviations_are_refused(setting, value):
-    with pytest.raises(InputError, match=f"nuisance geometry {setting} = "):
-        NuisanceGeometry(**{setting: value})
+def test_inadmissible_standard_deviations_are_refused():
+    for setting in ({"shape_mm": -0.1}, {"share": 1.0}):
+        with pytest.raises(InputError, match=r"nuisance geometry sha\w+ = "):
+            NuisanceGeometry(**setting)
 
 
 def test_scales_of_annulus_and_of_all_lengths():

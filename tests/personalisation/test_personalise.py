@@ -66,13 +66,9 @@ def test_a_twin_without_noise_gives_back_its_parameters():
         # The held-out frame fits too: its loads and its displacement are those of the case.
         assert distances["personalised"].max() < 1e-3
         assert 0.1 < distances["registered"].mean() < distances["generic"].mean()
-    closed, late = (f.distances["generic"].mean() for f in found.frames)
-    lines = str(found).splitlines()
-    assert lines[0] == f"case {found.case.name}"
-    assert lines[-2:] == [
-        f"closed: {closed:.2f} mm generic, 0.00 mm personalised",
-        f"late: {late:.2f} mm generic, 0.00 mm personalised (held out)",
-    ]
+    late = found.frames[1].distances["generic"].mean()
+    expected = f"late: {late:.2f} mm generic, 0.00 mm personalised (held out)"
+    assert str(found).splitlines()[-1] == expected
 
 
 def test_moduli_alone_are_the_estimate_without_nuisances(formula):
@@ -233,16 +229,11 @@ def test_inadmissible_priors_are_refused():
             Prior(*prior)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (unknowns()[:1], "has the leaflets anterior, posterior"),
-        ((*unknowns()[:2], Prior("chord_stiffness.tip9", 1.0, 0.5)), "tip9"),
-    ],
-)
-def test_unknowns_must_be_those_of_the_case(given, message):
-    with pytest.raises(InputError, match=message):
-        build_model(made_up_case(), settings(*given))
+def test_unknowns_must_be_those_of_the_case():
+    with pytest.raises(InputError, match="has the leaflets anterior, posterior"):
+        build_model(made_up_case(), settings(*unknowns()[:1]))
+    with pytest.raises(InputError, match="tip9"):
+        build_model(made_up_case(), settings(*unknowns()[:2], Prior("chord_stiffness.tip9", 1, 1)))
 
 
 SMALL = CaseMesh(
