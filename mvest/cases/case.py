@@ -185,7 +185,7 @@ class ValveCase:
     #: triangles of the reference frame.
     surface: LeafletSurface
     annulus: IntArray  #: (k,) vertices of ``surface`` in loop order
-    free_edge: IntArray
+    free_edge: IntArray  #: (j,) likewise
     #: In the order of time, one of them the reference and one the closed frame; or the reference
     #: alone, for an anatomy without an observed closure.
     frames: tuple[Frame, ...]

@@ -32,12 +32,12 @@ class FrameComparison:
 
     frame: Frame
     seen: bool  #: whether the filter received it
-    #: (n, 3) mm, vertices of the models ``generic`` (generic values of all unknowns),
-    #: ``registered`` (the same, rigidly aligned with the closed frame; not aligned without
-    #: correspondence) and ``personalised`` (estimated unknowns).
+    #: Model -> its vertices ``(n, 3)`` mm. The models are ``generic`` (generic values of all
+    #: unknowns), ``registered`` (the same, rigidly aligned with the closed frame; not aligned
+    #: without correspondence) and ``personalised`` (estimated unknowns).
     positions: Mapping[str, FloatArray]
-    #: (k,) mm, model -> distance of each corresponding vertex, or of each observed point from the
-    #: predicted surface.
+    #: Model -> distance ``(k,)`` mm of each corresponding vertex, or of each observed point from
+    #: the predicted surface.
     distances: Mapping[str, FloatArray]
 
 
@@ -53,7 +53,7 @@ class Personalised:
     alternatives: Mapping[str, StudyResult]
     #: Fitted frames first, the closed one at the front; empty without an estimate.
     frames: tuple[FrameComparison, ...] = ()
-    #: Largest distance of the fitted closed valve from the one closed anew.
+    #: Largest distance of the fitted closed valve from one closed from the open state.
     confirmed_mm: float | None = None
     #: ``geometry``, ``known``, ``data_alone``, ``narrower`` and ``shares`` as in
     #: `mvest.personalisation.record`; empty without an estimate.

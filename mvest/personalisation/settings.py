@@ -41,7 +41,7 @@ class Prior:
     #: A parameter of the mechanics (:data:`mvest.mechanics.parameters.KINDS`) such as
     #: ``E_f.REGION`` (MPa), or ``shift.x`` ... (mm), or ``turn.x`` ... (degrees).
     name: str
-    mean: float  #: in the same unit
+    mean: float  #: in the unit of the parameter
     std: float  #: in the same unit
     fixed: bool = False  #: whether it is fixed at its mean instead of estimated
 
@@ -127,8 +127,8 @@ class CaseMesh:
 class PaperSettings:
     """The paper's filter for the moduli alone, without nuisances."""
 
-    P0: Value = 0.01  #: MPa², variances of prior and process
-    Q: Value = 0.01  #: MPa², variances of prior and process
+    P0: Value = 0.01  #: MPa², variance of the prior
+    Q: Value = 0.01  #: MPa², variance of the process
     R: Value = 0.01  #: mm², variance of an observed coordinate
     max_iterations: Count = 12
 
@@ -140,7 +140,7 @@ class CaseChoices:
     mesh: CaseMesh = field(default_factory=CaseMesh)
     tolerance: Tolerance = 2e-3  #: of the filter, relative
     max_iterations: Count = 15
-    #: Of a parameter's logarithm between equilibria, see :class:`mvest.closure.model.ClosureModel`.
+    #: Of a parameter's logarithm between equilibria (`mvest.closure.model.ClosureModel`).
     largest_change: Logarithm = 0.2
     paper: PaperSettings | None = None  #: also estimate the moduli with the paper's filter
     moduli_only: bool = False  #: also estimate the moduli with all nuisances fixed
