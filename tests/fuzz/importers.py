@@ -117,7 +117,7 @@ def by_slicerheart(path: Path) -> object:
 IMPORTERS: dict[str, tuple[Enter, Makers]] = {
     "case": (
         lambda path: read_case(path.parent),
-        beside(case, "case.yaml", "chordae.csv", "pressure.csv", "errors.npz", "open.vtp"),
+        beside(case, "case.yaml", "chordae.csv", "errors.npz", "open.vtp"),
     ),
     "surface": (surface, of(
         "VTP: text, plain, UInt64, LittleEndian, Int64",
