@@ -116,13 +116,11 @@ class MadeUpClosure:
     fails_above: float = np.inf
     calls: list[np.ndarray] = field(default_factory=list)
     states: list[HeldState] = field(default_factory=list)
-    held_at: list[np.ndarray] = field(default_factory=list)
     valve = VALVE
     contact_valve = VALVE
     mesh = MESH
     settings = MECHANICS
     closed = None
-    contact_reach_mm = 1.5
 
     def restart(self, closed: Any) -> None:
         """Nothing is remembered."""
@@ -158,17 +156,13 @@ class MadeUpClosure:
             return [whole]
         half = len(whole.y) // 2
         parts = [replace(whole, y=whole.y[half:], jacobian=whole.jacobian[half:])]
-        for state in states:
-            self.states.append(state)
-            lift = np.tile((state.annulus - CLOSED_ANNULUS).mean(axis=0), (len(BASE), 1))
-            at = shape(self._values(m), state.pressure_mmHg) + lift
+        for at, state in zip(self.held(m, states), states, strict=True):
             parts.append(Prediction(at.ravel(), self._jacobian(m, state.pressure_mmHg)))
         return parts
 
-    def held(self, m: np.ndarray, states: Sequence[HeldState]) -> list[np.ndarray | None]:
+    def held(self, m: np.ndarray, states: Sequence[HeldState]) -> list[np.ndarray]:
         """The formula under other pressures; it is carried along with the annulus."""
         self.states += states
-        self.held_at += [np.array(m)] * len(states)
         lifts = [(state.annulus - CLOSED_ANNULUS).mean(axis=0) for state in states]
         return [
             shape(self._values(m), state.pressure_mmHg) + lift

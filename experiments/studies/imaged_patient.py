@@ -53,7 +53,6 @@ from mvest.reporting.skill import skill_table, verdict_table
 from mvest.reporting.tables import Column, Table, table
 from mvest.simulation.imaged_patient import (
     IMAGED,
-    EchoSettings,
     ImagedPatient,
     simulate_imaged_patient,
 )
@@ -92,7 +91,6 @@ class Settings:
     """What the study adds to the configuration."""
 
     patient: PatientSettings
-    echo: EchoSettings = field(default_factory=EchoSettings)
     volume: str | None = None  # written by the study
     imaged: ImagedInput = field(default_factory=ImagedInput)
     personal: PersonalSettings
@@ -102,7 +100,7 @@ class Settings:
 def run_imaged_patient(job: Job[Settings]) -> Result:
     """Simulate, estimate from the volume and from better geometries, then reveal the truth."""
     values, folder, personal = job.values, job.folder, job.settings.personal
-    place = make_imaged_patient(values, job.settings.patient, job.settings.echo)
+    place = make_imaged_patient(values, job.settings.patient)
     hidden = read_mapping(place / TRUTH / REVEALED)
     given = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
     found = estimate_hidden(given, folder, place / VOLUME, place / HIDDEN, personal)
@@ -136,19 +134,19 @@ def _numbers_if_converged(record: EstimateRecord) -> EstimateRecord:
 
 
 # -- the patient ----------------------------------------------------------------------------------
-def make_imaged_patient(values: Values, patient: PatientSettings, echo: EchoSettings) -> Path:
+def make_imaged_patient(values: Values, patient: PatientSettings) -> Path:
     """The folder of the configured patient, which is simulated and imaged once."""
     about = ("name", "description", "moduli", "moduli_spread", "variation", "deviations")
     described = {
         "patient": {key: values["patient"][key] for key in about},
-        **{key: values[key] for key in ("echo", "valve", "mechanics")},
+        **{key: values[key] for key in ("valve", "mechanics")},
         "uncertainty": KNOWN_UNCERTAINTY,
         "seed": values["seed"],
     }
     folder = Path(values["paths"]["outputs"]) / "virtual"
     entry = entry_of(folder, described, (_simulate, _write), _place, "{key}")
     return entry.get_or_make(
-        lambda: _simulate(values, patient, echo),
+        lambda: _simulate(values, patient),
         lambda root, made: _write(root, made, patient, described),
     )
 
@@ -158,19 +156,19 @@ def _place(root: Path) -> Path:
     return root
 
 
-def _simulate(values: Values, patient: PatientSettings, echo: EchoSettings) -> Made:
+def _simulate(values: Values, patient: PatientSettings) -> Made:
     rng = np.random.default_rng(values["seed"])
     hidden, mechanics = draw_patient_values(patient, rng), mechanics_of(values)
 
     def simulate(drawn: Template) -> ImagedPatient:
-        motion = draw_tip_motion(drawn, echo.tip_motion_mm, rng)
+        motion = draw_tip_motion(drawn, rng)
         valve = DrawnValve(patient.name, drawn, hidden, mechanics, motion)
         return simulate_imaged_patient(valve, IMAGED, MotionSettings())
 
     made, draws = first_that_closes(
         template_of(values), patient.variation, MAX_DRAWS, rng, simulate
     )
-    acquisition = draw_acquisition(rng, spread=echo.spread)
+    acquisition = draw_acquisition(rng)
     probe = draw_probe(rng, acquisition)
     return made, probe, simulate_volume(made.valve, acquisition, probe, values["seed"]), draws
 

@@ -173,48 +173,31 @@ class ErrorSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ValveCase:
-    """A valve and its observations.
-
-    Attributes
-    ----------
-    name, description, source, licence : str
-    simulated : bool
-        Whether the frames come from a simulation, which every picture and table then states.
-    surface : LeafletSurface
-        Midsurface of the reference frame with thickness and fibres; it has the vertices and
-        triangles of the reference frame.
-    annulus, free_edge : ndarray
-        ``(k,)`` and ``(j,)`` vertices of ``surface`` in loop order.
-    frames : tuple of Frame
-        In the order of time, one of them the reference and one the closed frame; or the reference
-        alone, for an anatomy without an observed closure.
-    chordae : Chordae
-    uncertainty : Uncertainty
-    derived : tuple of str
-        Sentences, one for everything that was derived instead of given.
-    sha256 : str
-        Of all files of the folder; empty for a case that was not read from one.
-    error_samples : ErrorSamples or None
-        Joint errors of all frames, in their order; all frames correspond then.
-    chordae_follow : bool
-        Whether chordae are laid out by the shape of the frames, and laid out again for each error
-        sample. Otherwise they are measured.
-    """
+    """A valve and its observations."""
 
     name: str
     description: str
     source: str
     licence: str
+    #: Whether the frames come from a simulation, which every picture and table then states.
     simulated: bool
+    #: Midsurface of the reference frame with thickness and fibres; it has the vertices and
+    #: triangles of the reference frame.
     surface: LeafletSurface
-    annulus: IntArray
-    free_edge: IntArray
+    annulus: IntArray  #: (k,) vertices of ``surface`` in loop order
+    free_edge: IntArray  #: (j,) likewise
+    #: In the order of time, one of them the reference and one the closed frame; or the reference
+    #: alone, for an anatomy without an observed closure.
     frames: tuple[Frame, ...]
     chordae: Chordae
     uncertainty: Uncertainty
+    #: Sentences, one for everything that was derived instead of given.
     derived: tuple[str, ...] = ()
-    sha256: str = ""
+    sha256: str = ""  #: of all files of the folder; empty for a case that was not read from one
+    #: Joint errors of all frames, in their order; all frames correspond then.
     error_samples: ErrorSamples | None = None
+    #: Whether chordae are laid out by the shape of the frames, and laid out again for each error
+    #: sample. Otherwise they are measured.
     chordae_follow: bool = False
 
     def __post_init__(self) -> None:

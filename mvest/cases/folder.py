@@ -2,22 +2,15 @@
 
 ``README.md`` in this package explains the fields. Every error begins with its file and field. Joint
 errors of all frames are one file of named arrays, NumPy's ``.npz``.
-
-The transmitral pressure over time is measured or generic. The generic curve is left ventricular
-minus left atrial pressure, each a monotone cubic (PCHIP) through the points that heart-valve
-simulations take from Yellin's data. Its clock is that of one cardiac cycle: the pressure rises from
-9 to 113 mmHg between 0.53 and 0.58 s and stays near 120 mmHg up to 0.70 s. Curves are not
-extrapolated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 import yaml
 
 from mvest.cases.band import check_closing_pressure
@@ -32,7 +25,6 @@ from mvest.cases.case import (
 )
 from mvest.cases.frames import (
     LOOPS,
-    SECONDS_PER,
     SeenFrame,
     place_frame,
     read_frame,
@@ -44,50 +36,9 @@ from mvest.errors import InputError
 from mvest.exchange.surfaces import write_surface
 from mvest.files import write_atomically
 from mvest.reading.npz import read_npz
-from mvest.reading.text import one_line, read_numbers, write_columns
+from mvest.reading.text import one_line, write_columns
 from mvest.typing import FloatArray
 from mvest.units import kpa_to_mpa, mpa_to_mmhg
-from mvest.valve.anatomy.valve import checked_floats
-
-VENTRICLE = ((0.40, 6.0), (0.53, 14.0), (0.58, 120.0), (0.75, 130.0), (0.80, 8.0))
-ATRIUM = ((0.40, 7.0), (0.47, 20.0), (0.53, 5.0), (0.58, 7.0), (0.70, 10.0))
-"""(s, mmHg)."""
-GENERIC_SAMPLES = 301
-"""One for every ms from 0.40 to 0.70 s."""
-
-
-def pressure_curve(time: FloatArray, pressure_mmhg: FloatArray) -> Callable[[float], float]:
-    """Transmitral pressure (mmHg) over time (s): PCHIP between points ``(k,)``, k >= 2.
-
-    InputError on wrong shapes, values that are not finite, or times that do not increase. The curve
-    itself raises InputError at a time outside it.
-    """
-    time = checked_floats("pressure curve: times", time, (None,))
-    pressure = checked_floats("pressure curve: pressures", pressure_mmhg, time.shape)
-    if len(time) < 2 or (np.diff(time) <= 0).any():
-        raise InputError(f"pressure curve: times {time} s, expected two or more that increase")
-    interpolated = scipy.interpolate.PchipInterpolator(time, pressure)
-
-    def curve(at: float) -> float:
-        if not time[0] <= at <= time[-1]:
-            raise InputError(
-                f"time {at:g} s lies outside the pressure curve, which runs from {time[0]:g} to "
-                f"{time[-1]:g} s; give the pressure of the frame, or a curve that covers its time"
-            )
-        return float(interpolated(at))
-
-    return curve
-
-
-def generic_curve() -> Callable[[float], float]:
-    """Ventricular minus atrial pressure from 0.40 to 0.70 s, where both are known."""
-    end = min(VENTRICLE[-1][0], ATRIUM[-1][0])
-    time = np.linspace(VENTRICLE[0][0], end, GENERIC_SAMPLES)
-    ventricle, atrium = (
-        scipy.interpolate.PchipInterpolator(*np.transpose(part))(time)
-        for part in (VENTRICLE, ATRIUM)
-    )
-    return pressure_curve(time, ventricle - atrium)
 
 
 def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
@@ -197,32 +148,14 @@ def _observation(
 
 def _pressures(folder: CaseFolder) -> list[float]:
     """Transmitral pressure (mmHg) of every frame."""
-    document = folder.document
-    unit = document.units.pressure
+    unit = folder.document.units.pressure
     to_mmhg = 1.0 if unit == "mmHg" else mpa_to_mmhg(kpa_to_mpa(1.0))
-    to_seconds = SECONDS_PER[document.units.time]
-    curve = generic_curve()
-    if document.pressure_curve is not None:
-        file = folder.file(document.pressure_curve, "pressure_curve")
-        with folder.at("pressure_curve"):
-            table = read_numbers(file, ("time", "pressure"))
-            curve = pressure_curve(to_seconds * table[:, 0], to_mmhg * table[:, 1])
-    result = []
-    for number, frame in enumerate(document.frames):
-        with folder.at(f"frames.{number}.pressure"):
-            if frame.pressure is not None:
-                pressure = to_mmhg * frame.pressure
-            else:
-                pressure = curve(to_seconds * frame.time)
-                if document.pressure_curve is None:
-                    folder.derived.append(
-                        f"pressure of frame {frame.name!r}: {pressure:.1f} mmHg of a generic "
-                        "transmitral curve, assumed to have the clock of the frames"
-                    )
-            if frame.role != Role.REFERENCE:
-                check_closing_pressure(pressure, unit)
-        result.append(pressure)
-    return result
+    pressures = [to_mmhg * frame.pressure for frame in folder.document.frames]
+    for number, frame in enumerate(folder.document.frames):
+        if frame.role != Role.REFERENCE:
+            with folder.at(f"frames.{number}.pressure"):
+                check_closing_pressure(pressures[number], unit)
+    return pressures
 
 
 def write_case(folder: Path | str, case: ValveCase) -> Path:
@@ -230,18 +163,9 @@ def write_case(folder: Path | str, case: ValveCase) -> Path:
 
     Everything is stated explicitly, in mm, s and mmHg, so that nothing is derived on reading. The
     folder must be new or empty, and appears only when it is complete. It is returned. InputError if
-    it is not empty or cannot be written, or the reference frame differs from the case's surface.
+    it is not empty or cannot be written.
     """
     target = require_new(folder)
-    frame, surface = case.frame(Role.REFERENCE), case.surface
-    own = {name: getattr(surface, name) for name in ("vertices", "triangles", "region")}
-    own |= {name: surface.vertices[getattr(case, name)] for name in LOOPS}
-    for name, wanted in own.items():
-        if not np.array_equal(getattr(frame, name), wanted):
-            raise InputError(
-                f"case {case.name}: {name} of the reference frame {frame.name!r} differs from the "
-                "surface's"
-            )
     return write_atomically(target, lambda part: _write_files(part, case))
 
 

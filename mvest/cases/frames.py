@@ -200,14 +200,12 @@ def place_frame(
 def _corresponds(folder: CaseFolder, first: SeenFrame, seen: SeenFrame) -> bool:
     same = len(seen.vertices) == len(first.vertices)
     same = same and np.array_equal(seen.triangles, first.triangles)
-    stated, where = seen.entry.corresponds, f"{seen.where}.corresponds"
-    if stated is None and folder.document.corresponds != "auto":
-        stated, where = folder.document.corresponds, "corresponds"
+    stated = seen.entry.corresponds
     if stated is None or seen is first:
         return same
     if stated and not same:
         what = f"true, but the triangles of frame {seen.entry.name!r} differ from the reference's"
-        raise folder.wrong(where, f"{what}; expected identical triangles")
+        raise folder.wrong(f"{seen.where}.corresponds", f"{what}; expected identical triangles")
     return stated
 
 

@@ -19,7 +19,6 @@ from mvest.cases.band import loop_vector_area
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import lumped_areas
 from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
 from mvest.valve.measure.clinical import leaflet_length
@@ -70,8 +69,6 @@ LOST = (0.2, 4.0)
 """Stretches of vertices that do not correspond at all."""
 REACH_MM = 4.0
 """Distance over which stretch is measured: several edges, so that noise counts less."""
-ORDER_STDS = 3.0
-"""Standard deviations by which leaflets must lie on the wrong side to question the pressures."""
 MAX_VERTICES = 1500
 """Number of vertices, evenly chosen, whose stretch is measured."""
 EXTREME_SHARE = 0.02
@@ -228,7 +225,7 @@ def _stretches(rest: FloatArray, closed: Frame, members: IntArray) -> tuple[floa
 
 
 def _exchanged(case: ValveCase) -> Iterator[Implausible]:
-    """Exchanged leaflets, frames and pressures."""
+    """Exchanged leaflets and frames."""
     reference, closed, length = case.frame(Role.REFERENCE), case.closed, _leaflet_lengths(case)
     part = _anterior_share(case) if length else 0.0
     if part > 0.5 and length["anterior"] < length["posterior"]:
@@ -247,16 +244,6 @@ def _exchanged(case: ValveCase) -> Iterator[Implausible]:
             f"{reference.name!r} {before:.0f} mm²: are the frames exchanged?"
         )
         yield Implausible("frames", text, mistake=True)
-    for other in case.fitted:
-        rise = _rise_with_pressure(case, closed, other)
-        if rise < 0:
-            high, low = sorted((closed, other), key=lambda f: f.pressure_mmHg, reverse=True)
-            text = (
-                f"under {high.pressure_mmHg:.3g} mmHg in {high.name!r} the leaflets lie "
-                f"{-rise:.1f} mm farther from the atrium than under {low.pressure_mmHg:.3g} mmHg "
-                f"in {low.name!r}: are frames or pressures exchanged?"
-            )
-            yield Implausible(f"frames.{other.name}.pressure", text, mistake=True)
 
 
 def _anterior_share(case: ValveCase) -> float:
@@ -268,23 +255,6 @@ def _anterior_share(case: ValveCase) -> float:
         own = np.isin(case.annulus, triangles)
         length[name] = float(step[own & np.roll(own, -1)].sum())
     return length["anterior"] / max(sum(length.values()), 1e-12)
-
-
-def _rise_with_pressure(case: ValveCase, closed: Frame, other: Frame) -> float:
-    """Motion of the leaflets (mm) towards the atrium by the larger pressure; 0 if insignificant."""
-    heights = []
-    for frame in (closed, other):
-        plane, size = _plane(case, frame), lumped_areas(frame.vertices, frame.triangles)
-        if plane is None:
-            return 0.0
-        heights.append(-float(plane.coordinates(frame.vertices)[:, 2] @ size / size.sum()))
-    rise = (heights[1] - heights[0]) * np.sign(other.pressure_mmHg - closed.pressure_mmHg)
-    seen = case.uncertainty
-    correlated = 2.0 * np.pi * seen.correlation_length_mm**2
-    whole = float(areas(closed.vertices, closed.triangles).sum())
-    independent = len(closed.vertices) if correlated == 0.0 else max(whole / correlated, 1.0)
-    significant = abs(rise) > ORDER_STDS * seen.typical_mm * np.sqrt(2.0 / independent)
-    return float(rise) if significant else 0.0
 
 
 def free_orifice(case: ValveCase, frame: Frame, vertices: FloatArray | None = None) -> float | None:

@@ -16,15 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Discriminator,
-    Field,
-    Tag,
-    ValidationError,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from mvest.cases.case import Role
 from mvest.errors import InputError
@@ -37,25 +29,12 @@ MAX_TEXT, MAX_NAME = 10_000, 200
 """Largest number of characters of a text, and of a name or a file name."""
 
 
-def _kind(value: Any) -> str:
-    """Alternative of a field that a value belongs to; no key of a file contains NUL."""
-    if isinstance(value, dict):
-        return "\0point data" if "point_data" in value else "\0mapping"
-    if isinstance(value, list):
-        return "\0list"
-    return "\0text" if isinstance(value, str) else "\0number"
-
-
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_NUMBER, le=MAX_NUMBER)]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=MAX_NUMBER)]
 Text = Annotated[str, Field(strict=True, max_length=MAX_TEXT)]
 Name = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_NAME)]
 Index = Annotated[int, Field(strict=True, ge=0, le=MAX_NUMBER)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
-NUMBER, TEXT, LIST, MAPPING, POINT_DATA = map(
-    Tag, ("\0number", "\0text", "\0list", "\0mapping", "\0point data")
-)
-EITHER = Discriminator(_kind)
 Regions = Annotated[
     dict[Annotated[int, Field(strict=True)], Name],
     Field(min_length=1),
@@ -64,10 +43,8 @@ Regions = Annotated[
         json_schema_input_type=list[Name] | dict[int, Name],
     ),
 ]
-SurfaceFiles = Annotated[
-    Annotated[Name, TEXT] | Annotated[dict[Name, Name], Field(min_length=1), MAPPING], EITHER
-]
-Curve = Annotated[Annotated[Name, TEXT] | Annotated[list[Index], Field(min_length=3), LIST], EITHER]
+SurfaceFiles = Name | Annotated[dict[Name, Name], Field(min_length=1)]
+Curve = Name | Annotated[list[Index], Field(min_length=3)]
 
 
 class _Model(BaseModel):
@@ -86,14 +63,6 @@ class PointData(_Model):
     """A field at the vertices of the reference surface."""
 
     point_data: Name = Field(description="the name of point data of the reference surface")
-
-
-Thickness = Annotated[
-    Annotated[Number, NUMBER]
-    | Annotated[PointData, POINT_DATA]
-    | Annotated[dict[Name, Number], MAPPING],
-    EITHER,
-]
 
 
 LOOP = "a list of vertex numbers in the order of the loop, or a .csv file"
@@ -116,8 +85,8 @@ class FrameEntry(_Model):
     papillary_tips: Annotated[list[Point], Field(min_length=1)] = Field(
         description="a list of [x, y, z] in units.length, in the same order in all frames"
     )
-    pressure: Number | None = Field(
-        None, description="transmitral pressure in units.pressure, positive where it closes"
+    pressure: Number = Field(
+        description="a number: transmitral pressure in units.pressure, positive if it closes"
     )
     corresponds: bool | None = Field(
         None,
@@ -154,9 +123,7 @@ ChordaeTable = Annotated[
 class ObservationEntry(_Model):
     """Errors of the vertices of a frame."""
 
-    std_mm: Annotated[
-        Annotated[Number, Field(gt=0), NUMBER] | Annotated[PointData, POINT_DATA], EITHER
-    ] = Field(
+    std_mm: Annotated[Number, Field(gt=0)] | PointData = Field(
         description="standard deviation of a coordinate in mm, > 0: a number, or "
         "{point_data: NAME} of the reference surface"
     )
@@ -183,7 +150,7 @@ class CaseFile(_Model):
     regions: Regions = Field(
         description="a list of names (labels 0, 1, ...) or a mapping from label to name"
     )
-    thickness: Thickness | None = Field(
+    thickness: Number | PointData | dict[Name, Number] | None = Field(
         None, description="mm: a number, a number for every region, or {point_data: NAME}"
     )
     fibre: Name | None = Field(
@@ -192,17 +159,11 @@ class CaseFile(_Model):
     frames: Annotated[list[FrameEntry], Field(min_length=1)] = Field(
         description="a list of frames in the order of time, or the reference alone"
     )
-    pressure_curve: Name | None = Field(
-        None, description="a .csv file with the columns time,pressure"
-    )
     chordae: ChordaeTable | None = Field(
         None, description="a .csv file, or a mapping with file, toe_strain and families"
     )
     observation: ObservationEntry | None = Field(
         None, description="a mapping with std_mm, correlation_length_mm and error_samples"
-    )
-    corresponds: bool | Literal["auto"] = Field(
-        "auto", description="true, false or auto: do vertices correspond between all frames"
     )
     derived: list[Text] = Field(
         default_factory=list,
@@ -212,7 +173,6 @@ class CaseFile(_Model):
     def files(self) -> list[tuple[str, str]]:
         """Field and name of every file that the case names."""
         named: list[tuple[str, object]] = [
-            ("pressure_curve", self.pressure_curve),
             ("chordae", getattr(self.chordae, "file", None)),
             ("observation", getattr(self.observation, "error_samples", None)),
         ]
@@ -226,7 +186,12 @@ class CaseFile(_Model):
 
 def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, str]:
     """Dotted field and a sentence for one of pydantic's errors."""
-    path = [part for part in loc if not (isinstance(part, str) and part.startswith("\0"))]
+    path: list[int | str] = []
+    for part in loc:  # pydantic also names the alternatives of a type, which are not fields
+        if isinstance(part, int) or part in _place(path)[0].model_fields:
+            path.append(part)
+    if kind == "extra_forbidden":
+        path.append(loc[-1])
     field = ".".join(str(part) for part in path)
     if kind == "extra_forbidden":
         model, _ = _place(path[:-1])

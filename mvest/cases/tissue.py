@@ -219,7 +219,7 @@ class LeafletBand:
 
     vertices: FloatArray  #: (n, 3) mm
     coordinates: SurfaceCoordinates
-    annulus_angle: FloatArray  #: (2, k): phi (0 to 360 degrees), harmonic angle (rad, unwrapped)
+    annulus_angle: FloatArray  #: (2, k), phi (0 to 360 degrees), harmonic angle (rad, unwrapped)
     edge_angle: FloatArray  #: the same along the free edge
 
     @classmethod

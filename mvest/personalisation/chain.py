@@ -43,7 +43,6 @@ def personalise(
 
     Parameters
     ----------
-    case : ValveCase
     settings : PersonaliseSettings, optional
         Default: `default_settings`.
     store : Path, optional
@@ -94,14 +93,8 @@ def predicted_frames(
 ) -> dict[str, FloatArray]:
     """Predicted vertices ``(n, 3)`` mm of all fitted and held-out frames, as observed.
 
-    Parameters
-    ----------
-    problem : CaseProblem
-    point : LinearisationPoint
-        Its closure predicts.
-    m : (p,)
-    closed : array
-        Predicted frames at ``m``, stacked, the closed one last.
+    The closure of ``point`` predicts. ``closed`` are the predicted frames at ``m (p,)``, stacked,
+    the closed one last.
     """
     closure, fitted, case = point.closure, problem.fitted, problem.case
     shown = closed.reshape(-1, len(case.surface.vertices), 3)[-len(fitted.frames) :]

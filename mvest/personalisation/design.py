@@ -36,12 +36,7 @@ def expect_case(
 ) -> Expected:
     """Expected precision of an estimate of a case, to first order about the generic valve.
 
-    Parameters
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-    model : ClosureModel, optional
-        The closure of the case; default: on the guide mesh.
+    The default model is the closure on the guide mesh.
     """
     model = build_coarse(case, settings) if model is None else model
     problem = CaseProblem.of(case, settings, model=model)
@@ -90,29 +85,18 @@ def errors_of(kind: str, mmhg: float, pressure_mmHg: float) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameDesigns:
-    """Information of closed frames of one valve.
+    """Information of closed frames of one valve."""
 
-    Attributes
-    ----------
-    pressures_mmHg : tuple of float
-        Stated pressures of the frames, the closed one's first.
-    names : tuple of str, (q,)
-        The unknowns of the case, the pressures' errors in mmHg (`mvest.closure.frames`) and
-        the modes of the geometry, if it is uncertain.
-    triangles : (f, q, q)
-        Root T of the information Tᵀ T of each frame about the unknowns, relative for positive ones,
-        otherwise in their units.
-    knowledge : mapping
-        Unknown except for errors of pressures -> its prior standard deviation in the same terms.
-    stated : mapping
-        Errors of the pressures as stated.
-    """
-
-    pressures_mmHg: tuple[float, ...]
+    pressures_mmHg: tuple[float, ...]  #: stated pressures of the frames, the closed one's first
+    #: (q,), the unknowns of the case, the pressures' errors in mmHg (`mvest.closure.frames`) and
+    #: the modes of the geometry, if it is uncertain.
     names: tuple[str, ...]
+    #: (f, q, q), root T of the information Tᵀ T of each frame about the unknowns, relative for
+    #: positive ones, otherwise in their units.
     triangles: FloatArray
+    #: Unknown except for errors of pressures -> its prior standard deviation in the same terms.
     knowledge: Mapping[str, float]
-    stated: Errors
+    stated: Errors  #: errors of the pressures as stated
 
     def chosen(self, count: int) -> tuple[int, ...]:
         """The frames of a design of ``count``: spread evenly over the pressures."""
@@ -126,13 +110,8 @@ class FrameDesigns:
     ) -> dict[str, float]:
         """Posterior standard deviation of each unknown from ``count`` frames.
 
-        Parameters
-        ----------
-        count : int
-        errors : mapping, optional
-            Of the pressures; default: as stated.
-        known : tuple of str
-            Further unknowns that are known exactly, by the first part of their names.
+        By default the errors of the pressures are those stated. ``known`` are further unknowns that
+        are known exactly, by the first part of their names.
         """
         errors, members = errors or self.stated, self.chosen(count)
         pressures = {SCALE: errors["factor"], OFFSET: errors["offset"]}

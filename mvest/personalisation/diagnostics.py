@@ -39,7 +39,6 @@ def diagnostics_of(
 
     Parameters
     ----------
-    fit : Personalised
     gate : bool, optional
         Whether its valve passed the gate; None if untested.
     unlike : str
@@ -75,9 +74,9 @@ def diagnostics_of(
         roots = dict(zip(("root", "low", "high"), np.sqrt([nis, low, high]), strict=True))
         seen["innovation"] = [(nis / high, roots)]
     if filtered.standardised is not None and result.observation is not None:
-        alike = _alike(result.observation, filtered.standardised)
-        if alike is not None:
-            seen["alike"] = [(abs(alike), {"alike": alike})]
+        correlation = _neighbour_correlation(result.observation, filtered.standardised)
+        if correlation is not None:
+            seen["correlation"] = [(abs(correlation), {"correlation": correlation})]
     alone = {one["parameter"]: one["prior_stds"] for one in fit.details.get("data_alone", ())}
     for key, sizes in (("stretch", _stretch(fit, filtered)), ("data_alone", alone)):
         if sizes:
@@ -116,7 +115,7 @@ def _stretch(fit: Personalised, filtered: Estimate) -> dict[str, float]:
     return moved | {f"{own['name']} of the valve": own["stretch"] for own in shifts}
 
 
-def _alike(observation: Observed, standardised: FloatArray) -> float | None:
+def _neighbour_correlation(observation: Observed, standardised: FloatArray) -> float | None:
     """Largest covariance of neighbours in the standardised innovation, over the coordinates.
 
     Moran's I (`moran`), in units of the stated variance if the actual one is smaller.
@@ -139,6 +138,7 @@ def _alike(observation: Observed, standardised: FloatArray) -> float | None:
     one_way = coo_matrix((ones, (rows, near[:, 1:].ravel())), shape=(len(points),) * 2)
     neighbours = csr_array(one_way.maximum(one_way.T))
     statistics = [
-        moran(column, neighbours) * min(1.0, float(np.var(column))) for column in values.T
+        moran(column, neighbours) * min(1.0, float(np.var(column))) if np.ptp(column) else 0.0
+        for column in values.T
     ]
     return float(max(statistics, key=abs))

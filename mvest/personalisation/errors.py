@@ -50,18 +50,11 @@ KNOWN = "errors of known size"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeighedObservation:
-    """An observation with another noise and an offset; see `Observed` for its members.
-
-    Attributes
-    ----------
-    plain : Observed
-    R : NoiseCovariance
-    offset : (k,) or float
-        Added to the observation: the effect of the model's displaced geometry on its prediction.
-    """
+    """An observation with another noise and an offset; see `Observed` for its members."""
 
     plain: Observed
     R: NoiseCovariance
+    #: ``(k,)``, added to the observation: effect of the displaced geometry on the prediction.
     offset: FloatArray | float = 0.0
 
     @property
@@ -85,32 +78,18 @@ class WeighedObservation:
 
 @dataclass(frozen=True, eq=False)
 class FrameErrors:
-    """All errors of the fitted frames besides the unknowns, about one closed valve.
-
-    Attributes
-    ----------
-    fitted : FittedFrames
-    modes : tuple of GeometryModes or None
-        Uncertain geometry; None before the first linearisation.
-    displaced_by : tuple of (q,)
-        Amplitudes by mode and kind that displace the model's geometry; empty: as measured.
-    sources : tuple of ErrorSource
-        Errors of geometry, law and mesh.
-    frame_samples : FrameSamples or None
-        Effect of the case's error samples on the predicted and the observed closed frame.
-    samples : SampledErrors or None
-        Their effect on the innovation.
-    unaccounted : tuple of str
-        Why some errors could not be linearised.
-    """
+    """All errors of the fitted frames besides the unknowns, about one closed valve."""
 
     fitted: FittedFrames
+    #: Uncertain geometry; None before the first linearisation.
     modes: tuple[GeometryModes, ...] | None = None
+    #: Amplitudes ``(q,)`` by kind that displace the model's geometry; empty: as measured.
     displaced_by: tuple[FloatArray, ...] = ()
-    sources: tuple[ErrorSource, ...] = ()
+    sources: tuple[ErrorSource, ...] = ()  #: errors of geometry, law and mesh
+    #: Effect of the case's error samples on the predicted and the observed closed frame.
     frame_samples: FrameSamples | None = None
-    samples: SampledErrors | None = None
-    unaccounted: tuple[str, ...] = ()
+    samples: SampledErrors | None = None  #: effect of the error samples on the innovation
+    unaccounted: tuple[str, ...] = ()  #: why some errors could not be linearised
 
     @property
     def geometry(self) -> tuple[ErrorSource, ...]:
@@ -258,7 +237,6 @@ def linearise(
     ----------
     errors : FrameErrors
         Those about another closed valve, or without sources.
-    valve : ClosedValve
     seen : ClosureModel, optional
         Of the measured geometry, if that of ``valve`` is displaced.
     """

@@ -79,53 +79,30 @@ class LinearisationPoint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseEstimate:
-    """The estimate of all unknowns of a case.
-
-    Attributes
-    ----------
-    result : StudyResult
-    point : LinearisationPoint
-        Of the last estimate.
-    moved : float or None
-        Largest distance of a modulus from there in standard deviations; None if the geometry was
-        linearised about the measured one only.
-    unaccounted : tuple of str
-        Why some errors of geometry or law are not in the intervals.
-    """
+    """The estimate of all unknowns of a case."""
 
     result: StudyResult
-    point: LinearisationPoint
+    point: LinearisationPoint  #: of the last estimate
+    #: Largest distance of a modulus from there in standard deviations; None if the geometry was
+    #: linearised about the measured one only.
     moved: float | None = None
+    #: Why some errors of geometry or law are not in the intervals.
     unaccounted: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseProblem:
-    """The estimation problem of a case.
-
-    Attributes
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-        With the errors of the pressures of several frames among the unknowns.
-    unknowns : tuple of Prior, (p,)
-        The estimated ones: those of the closure in its order, then the displacement.
-    prior : Gaussian
-        Of these.
-    transform : Log
-    fitted : FittedFrames
-    stated : CaseClosure
-        Of the valve as the case states it.
-    on_iterate : callable or None
-    """
+    """The estimation problem of a case."""
 
     case: ValveCase
+    #: With the errors of the pressures of several frames among the unknowns.
     settings: PersonaliseSettings
+    #: (p,), the estimated ones: those of the closure in its order, then the displacement.
     unknowns: tuple[Prior, ...]
-    prior: Gaussian
+    prior: Gaussian  #: of these
     transform: Log
     fitted: FittedFrames
-    stated: CaseClosure
+    stated: CaseClosure  #: of the valve as the case states it
     on_iterate: OnIterate | None = None
 
     @classmethod
@@ -138,16 +115,9 @@ class CaseProblem:
         on_iterate: OnIterate | None = None,
         model: ClosureModel | None = None,
     ) -> CaseProblem:
-        """The problem of a case.
+        """The problem of a case; the parameters are those of `personalise`.
 
-        Parameters
-        ----------
-        case : ValveCase
-        settings : PersonaliseSettings
-        store, on_step, on_iterate
-            As of `personalise`.
-        model : ClosureModel, optional
-            From `build_model`, possibly closed already.
+        ``model`` comes from `build_model` and may have been closed.
 
         Raises
         ------
@@ -272,13 +242,8 @@ def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstim
     """Estimate all unknowns, with the errors of geometry and law.
 
     The effects of these errors depend on the moduli: at half the modulus, derivatives are off by a
-    quarter. So a rough estimate without them gives the first linearisation point.
-
-    Parameters
-    ----------
-    problem : CaseProblem
-    generic : LinearisationPoint
-        With the effect of error samples, if the case has any.
+    quarter. So a rough estimate without them gives the first linearisation point. The generic valve
+    has the effect of the error samples of its case, if there are any.
     """
     settings = problem.settings
     if settings.nuisance_geometry is None and not settings.nuisance_law:

@@ -47,21 +47,12 @@ are interpolated."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedFrames:
-    """The fitted frames of a case.
-
-    Attributes
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-    valve : Valve
-        Of the closure.
-    several : tuple of str or None
-        Names of several fitted frames in the order of prediction, the closed frame last.
-    """
+    """The fitted frames of a case."""
 
     case: ValveCase
     settings: PersonaliseSettings
-    valve: Valve
+    valve: Valve  #: of the closure
+    #: Names of several fitted frames in the order of prediction, the closed frame last.
     several: tuple[str, ...] | None
 
     @property

@@ -34,52 +34,31 @@ class NuisanceGeometry:
     leaflet in 3D echocardiography; a voxel for the annulus; two voxels for the tips, of which
     images show the muscle; the size of a patch of chordal branches for the insertions; for
     thickness and fibres the variation between hearts.
-
-    Attributes
-    ----------
-    shape_mm, shape_length_mm : float
-        Of each coordinate of the open shape, and the correlation length of these errors.
-    annulus_mm, annulus_length_mm : float
-        The same of the closed annulus.
-    leaflet_scale, annulus_scale, frame_scale : float
-        Relative errors of the length of each leaflet from annulus to free edge in the open frame,
-        of the size of the closed annulus, and of all lengths of all frames. Errors correlated over
-        a few millimetres hardly contain them, but an outline drawn too wide does.
-    tips_mm : float
-        Of each coordinate of a papillary tip.
-    insertions_mm : float
-        Of each coordinate of a chordal insertion, along the leaflet.
-    rest_lengths : float
-        Relative, of the rest length of each chord that was laid out from the frames, besides a
-        common factor. Stated rest lengths have only the common factor.
-    thickness : float
-        Relative, of each leaflet.
-    fibre_degrees : float
-        Of each leaflet.
-    factor : float
-        One standard deviation, as a factor, of the size of errors of open shape and annulus, if
-        errors are learned.
-    share : float
-        Share of the variance that smooth modes represent; finer modes are dropped.
-    renewals : int
-        How often, at most, the geometry is relinearised about its posterior mean instead of the
-        measured one. Each takes somewhat less time than the estimate.
     """
 
-    shape_mm: Length = 0.3
-    shape_length_mm: Length = 10.0
-    annulus_mm: Length = 0.5
-    annulus_length_mm: Length = 20.0
+    shape_mm: Length = 0.3  #: of each coordinate of the open shape
+    shape_length_mm: Length = 10.0  #: correlation length of these errors
+    annulus_mm: Length = 0.5  #: of each coordinate of the closed annulus
+    annulus_length_mm: Length = 20.0  #: correlation length of these errors
+    #: Relative, of each open leaflet's length from annulus to free edge. Errors correlated over a
+    #: few millimetres hardly contain such errors of scale, but an outline drawn too wide does.
     leaflet_scale: Share = 0.0
-    annulus_scale: Share = 0.0
-    frame_scale: Share = 0.0
-    tips_mm: Length = 1.0
-    insertions_mm: Length = 0.5
+    annulus_scale: Share = 0.0  #: relative, of the size of the closed annulus
+    frame_scale: Share = 0.0  #: relative, of all lengths of all frames
+    tips_mm: Length = 1.0  #: of each coordinate of a papillary tip
+    insertions_mm: Length = 0.5  #: of each coordinate of a chordal insertion, along the leaflet
+    #: Relative, of the rest length of each chord that was laid out from the frames, besides a
+    #: common factor. Stated rest lengths have only the common factor.
     rest_lengths: Share = 0.0
-    thickness: Share = 0.1
-    fibre_degrees: Angle = 10.0
+    thickness: Share = 0.1  #: relative, of each leaflet
+    fibre_degrees: Angle = 10.0  #: of each leaflet
+    #: One standard deviation, as a factor, of the size of errors of open shape and annulus, if
+    #: errors are learned.
     factor: Factor = 2.0
+    #: Share of the variance that smooth modes represent; finer modes are dropped.
     share: Share = 0.9
+    #: How often, at most, the geometry is relinearised about its posterior mean instead of the
+    #: measured one. Each takes somewhat less time than the estimate.
     renewals: Count = 0
 
     def __post_init__(self) -> None:
@@ -95,20 +74,12 @@ class NuisanceGeometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GeometryModes:
-    """Independent errors of one kind of geometry, one standard deviation each.
-
-    Attributes
-    ----------
-    name : str
-    parts : mapping
-        Of `mvest.closure.rest_geometry.PARTS` -> ``(q, ...)``, the change by each mode.
-    factor : float
-        One standard deviation, as a factor, of their size.
-    """
+    """Independent errors of one kind of geometry, one standard deviation each."""
 
     name: str
+    #: Of `mvest.closure.rest_geometry.PARTS` -> ``(q, ...)``, the change by each mode.
     parts: Mapping[str, FloatArray]
-    factor: float = 1.0
+    factor: float = 1.0  #: one standard deviation, as a factor, of their size
 
     def __len__(self) -> int:
         return len(next(iter(self.parts.values())))
@@ -237,7 +208,6 @@ def rest_lengths_by_ends(
 
     Parameters
     ----------
-    case : ValveCase
     open_moves, closed_moves : (q, c, 3) mm
         Displacement of the insertion of each chord relative to its tip in these frames.
     """

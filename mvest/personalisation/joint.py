@@ -30,26 +30,13 @@ AS_PREDICTED = 0.75
 
 @dataclass(frozen=True)
 class JointPosterior:
-    """Posterior of parameters m and geometry modes, with all other errors marginalised.
+    """Posterior of parameters m and geometry modes, with all other errors marginalised."""
 
-    Attributes
-    ----------
-    prior : Gaussian
-        Of the parameters in filter coordinates z.
-    transform : Transform
-    observation : Observed
-        As measured.
-    errors : FrameErrors
-        With linearised effects of the geometry.
-    learned : LearnedNoise or None
-        None: errors as stated.
-    """
-
-    prior: Gaussian
+    prior: Gaussian  #: of the parameters in filter coordinates z
     transform: Transform
-    observation: Observed
-    errors: FrameErrors
-    learned: LearnedNoise | None
+    observation: Observed  #: as measured
+    errors: FrameErrors  #: with linearised effects of the geometry
+    learned: LearnedNoise | None  #: None: errors as stated
 
     @cached_property
     def noise(self) -> ObservationNoise:
@@ -82,13 +69,8 @@ class JointPosterior:
     def misfit(self, z: FloatArray, residual: FloatArray, modes: tuple[FloatArray, ...]) -> float:
         """Twice the negative logarithm of the density, up to a constant.
 
-        Parameters
-        ----------
-        z : (p,)
-        residual : (k,)
-            Of the observation.
-        modes : tuple of (q,)
-            Amplitudes by kind; empty: the measured geometry.
+        At parameters ``z (p,)`` with the residual ``(k,)`` of the observation. The modes are the
+        amplitudes ``(q,)`` by kind; empty: the measured geometry.
         """
         moved, white = z - self.prior.mean, self.noise.whiten(residual)
         own = moved @ np.linalg.solve(self.prior.covariance, moved)
@@ -106,13 +88,7 @@ class JointPosterior:
     def step(self, z: FloatArray, residual: FloatArray, H: FloatArray) -> FloatArray:
         """Parameters ``(p,)`` after a Gauss-Newton step with the geometry marginalised.
 
-        Parameters
-        ----------
-        z : (p,)
-        residual : (k,)
-            Of the observation at ``z``.
-        H : (k, p)
-            Derivatives of the prediction by ``z``.
+        From ``z (p,)``, with the residual ``(k,)`` and the derivatives ``H (k, p)`` there.
         """
         innovation = residual + H @ (z - self.prior.mean)
         return kalman_update(self.prior, innovation, H, self.marginal).posterior.mean
@@ -140,14 +116,9 @@ def damped_step(
     gives the length, so that steps across a curved valley do not oscillate. Empty if the full step
     was possible but nothing is better than the start.
 
-    Parameters
-    ----------
-    trial : callable
-        Share of the step -> misfit and point there, or why there is none.
-    here : float
-        Misfit at the start.
-    predicted : float
-        Decrease of the misfit by the full step, to first order.
+    ``trial`` maps a share of the step to misfit and point there, or to the reason why there is
+    none. The misfit is ``here`` at the start, and ``predicted`` lower after the full step to first
+    order.
     """
     best: T | None = None
     lowest, share, why = here, 1.0, ""

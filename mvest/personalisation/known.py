@@ -33,7 +33,7 @@ REACH = 1.959963984540054
 """Standard deviations from the mean of a normal distribution to the ends of its 95 % interval."""
 
 IMAGES, SINGLE = "errors of the images", "errors of single points"
-DOUBT, MODULI = "size of the errors", "prior of the moduli"
+SIZE, MODULI = "size of the errors", "prior of the moduli"
 """Sources of variance besides the unknowns and the errors of geometry and law."""
 
 STEP = 1e-3
@@ -49,26 +49,13 @@ UNITS = {
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """The observation to first order about a closed valve.
+    """The observation to first order about a closed valve."""
 
-    Attributes
-    ----------
-    names : tuple of str, (p,)
-        Of the unknowns.
-    prior : (p, p)
-        Covariance of the unknowns, in filter coordinates.
-    H : (k, p)
-        Derivatives of the observation in these.
-    errors : FrameErrors
-    learned : LearnedNoise or None
-        None: errors as stated.
-    """
-
-    names: tuple[str, ...]
-    prior: FloatArray
-    H: FloatArray
+    names: tuple[str, ...]  #: (p,), of the unknowns
+    prior: FloatArray  #: (p, p), covariance of the unknowns, in filter coordinates
+    H: FloatArray  #: (k, p), derivatives of the observation in these
     errors: FrameErrors
-    learned: LearnedNoise | None = None
+    learned: LearnedNoise | None = None  #: None: errors as stated
 
     @classmethod
     def of(cls, filtered: Estimate, errors: FrameErrors) -> LinearModel:
@@ -169,10 +156,13 @@ class LinearModel:
             return np.einsum("...j,jk,...k->...", slopes_, covariance, slopes_)
         images = np.array(self.sources) == IMAGES
         rest = slopes_[..., ~images]
-        variance = np.einsum("...j,jk,...k->...", rest, covariance[~images][:, ~images], rest)
+        # With unit priors, the covariance with the samples is minus their effect on the estimate.
+        effect = -covariance[~images][:, images]
+        others = covariance[~images][:, ~images] - effect @ effect.T
         # A sample moves the valve directly, and the estimate through the gain.
-        moved = slopes_[..., :p] @ self._sampled.moved - slopes_[..., images]
-        return np.asarray(variance + np.sum(moved**2, axis=-1))
+        effect[:p] = self._sampled.moved
+        moved = rest @ effect - slopes_[..., images]
+        return np.einsum("...j,jk,...k->...", rest, others, rest) + np.sum(moved**2, axis=-1)
 
     @cached_property
     def parts(self) -> dict[str, FloatArray]:
@@ -200,7 +190,7 @@ class LinearModel:
         if self._sampled is not None:
             parts[IMAGES] = np.diag(self._sampled.from_samples)
         if self.learned is not None:
-            parts[DOUBT] = np.diag(self.learned.covariance)
+            parts[SIZE] = np.diag(self.learned.covariance)
         return parts
 
 

@@ -58,8 +58,6 @@ def build_model(
 
     Parameters
     ----------
-    case : ValveCase
-    settings : PersonaliseSettings
     store : Path, optional
         Folder in which an unstructured mesh is cached.
 
@@ -125,25 +123,13 @@ def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseClosure:
-    """The closure of a case's valve in the forms that an estimation needs.
-
-    Attributes
-    ----------
-    model : ClosureModel
-    frames : FramesModel or None
-        All fitted closed frames, if there are several.
-    registered : RegisteredModel
-        The same, with the rigid displacement of the observed frames.
-    shared : SharedStart
-        The same, for many estimations.
-    displacement : mapping
-        Part -> difference from the measured geometry; see `RestGeometry.displaced`.
-    """
+    """The closure of a case's valve in the forms that an estimation needs."""
 
     model: ClosureModel
-    frames: FramesModel | None
-    registered: RegisteredModel
-    shared: SharedStart
+    frames: FramesModel | None  #: all fitted closed frames, if there are several
+    registered: RegisteredModel  #: the same, with the rigid displacement of the observed frames
+    shared: SharedStart  #: the same, for many estimations
+    #: Part -> difference from the measured geometry; see `RestGeometry.displaced`.
     displacement: Mapping[str, FloatArray]
 
     @classmethod

@@ -64,7 +64,6 @@ def record_of_case(
 
     Parameters
     ----------
-    fit : Personalised
     gate : bool, optional
         Whether its anatomy passed the gate; None if untested.
     images : mapping, optional
@@ -111,7 +110,7 @@ def _correlation(result: StudyResult) -> tuple[Numbers, ...]:
 
 
 def _details(fit: Personalised) -> dict[str, tuple[Row, ...]]:
-    """Name -> rows, as far as `Personalised.details` lacks them."""
+    """Name -> the rows that are not in `Personalised.details`."""
     case, filtered = fit.case, fit.result.filtered
     check = None if filtered is None else filtered.check
     about: dict[str, Any] = {

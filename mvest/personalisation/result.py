@@ -18,88 +18,53 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """Expected precision of an estimate; without unknowns, the reason why it is unknown.
+    """Expected precision of an estimate; without unknowns, the reason why it is unknown."""
 
-    Attributes
-    ----------
-    unknowns : sequence of mapping
-        From `mvest.problem.estimate.expected_intervals`.
-    shares, narrower : sequence of mapping
-        Rows as in `mvest.personalisation.record`.
-    reason : str
-    """
-
-    unknowns: Sequence[Mapping[str, Any]] = ()
-    shares: Sequence[Row] = ()
-    narrower: Sequence[Row] = ()
+    unknowns: Sequence[Mapping[str, Any]] = ()  #: from `mvest.problem.estimate.expected_intervals`
+    shares: Sequence[Row] = ()  #: rows as in `mvest.personalisation.record`
+    narrower: Sequence[Row] = ()  #: rows as in `mvest.personalisation.record`
     reason: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameComparison:
-    """An observed frame, three predictions of it, and their distances from it.
-
-    Attributes
-    ----------
-    frame : Frame
-    seen : bool
-        Whether the filter received it.
-    positions : mapping of str to (n, 3) mm
-        Vertices of the models ``generic`` (generic values of all unknowns), ``registered`` (the
-        same, rigidly aligned with the closed frame; not aligned without correspondence) and
-        ``personalised`` (estimated unknowns).
-    distances : mapping of str to (k,) mm
-        Model -> distance of each corresponding vertex, or of each observed point from the predicted
-        surface.
-    """
+    """An observed frame, three predictions of it, and their distances from it."""
 
     frame: Frame
-    seen: bool
+    seen: bool  #: whether the filter received it
+    #: Model -> its vertices ``(n, 3)`` mm. The models are ``generic`` (generic values of all
+    #: unknowns), ``registered`` (the same, rigidly aligned with the closed frame; not aligned
+    #: without correspondence) and ``personalised`` (estimated unknowns).
     positions: Mapping[str, FloatArray]
+    #: Model -> distance ``(k,)`` mm of each corresponding vertex, or of each observed point from
+    #: the predicted surface.
     distances: Mapping[str, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Personalised:
-    """Result of a personalisation.
-
-    Attributes
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-    mesh : SolidMesh
-    result : StudyResult
-    alternatives : mapping of str to StudyResult
-        ``moduli_only`` and ``paper``, see `mvest.personalisation.settings.CaseChoices`.
-    frames : tuple of FrameComparison
-        Fitted frames first, the closed one at the front; empty without an estimate.
-    confirmed_mm : float or None
-        Largest distance of the fitted closed valve from the one closed anew.
-    details : mapping of str to tuple of mapping
-        ``geometry``, ``known``, ``data_alone``, ``narrower`` and ``shares`` as in
-        `mvest.personalisation.record`; empty without an estimate.
-    law_share : float or None
-        Estimated position of the tissue between the linear law (0) and another (1).
-    error_samples : int
-        Number of error samples of the frames.
-    unaccounted : tuple of str
-        Why some errors of geometry or law are not in the intervals.
-    moved : float or None
-        Largest distance of a modulus from the last linearisation point of the geometry, in standard
-        deviations; None if that is the measured geometry.
-    """
+    """Result of a personalisation."""
 
     case: ValveCase
     settings: PersonaliseSettings
     mesh: SolidMesh
     result: StudyResult
+    #: ``moduli_only`` and ``paper``, see `mvest.personalisation.settings.CaseChoices`.
     alternatives: Mapping[str, StudyResult]
+    #: Fitted frames first, the closed one at the front; empty without an estimate.
     frames: tuple[FrameComparison, ...] = ()
+    #: Largest distance of the fitted closed valve from one closed from the open state.
     confirmed_mm: float | None = None
+    #: ``geometry``, ``known``, ``data_alone``, ``narrower`` and ``shares`` as in
+    #: `mvest.personalisation.record`; empty without an estimate.
     details: Mapping[str, tuple[Row, ...]] = field(default_factory=dict)
+    #: Estimated position of the tissue between the linear law (0) and another (1).
     law_share: float | None = None
-    error_samples: int = 0
+    error_samples: int = 0  #: number of error samples of the frames
+    #: Why some errors of geometry or law are not in the intervals.
     unaccounted: tuple[str, ...] = ()
+    #: Largest distance of a modulus from the last linearisation point of the geometry, in standard
+    #: deviations; None if that is the measured geometry.
     moved: float | None = None
 
     def __str__(self) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mvest.cases.case import ValveCase
 from mvest.closure.frames import ERROR, OFFSET, is_frame_pressure
-from mvest.errors import InputError, require_numbers
+from mvest.errors import InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings, TissueSettings
@@ -36,23 +36,14 @@ STIFFENS = "stiffening."
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """The prior of one unknown of a case.
+    """The prior of one unknown of a case."""
 
-    Attributes
-    ----------
-    name : str
-        A parameter of the mechanics (:data:`mvest.mechanics.parameters.KINDS`) such as
-        ``E_f.REGION`` (MPa), or ``shift.x`` ... (mm), or ``turn.x`` ... (degrees).
-    mean, std : float
-        In the same unit.
-    fixed : bool
-        Whether it is fixed at its mean instead of estimated.
-    """
-
+    #: A parameter of the mechanics (:data:`mvest.mechanics.parameters.KINDS`) such as
+    #: ``E_f.REGION`` (MPa), or ``shift.x`` ... (mm), or ``turn.x`` ... (degrees).
     name: str
-    mean: float
-    std: float
-    fixed: bool = False
+    mean: float  #: in the unit of the parameter
+    std: float  #: in the same unit
+    fixed: bool = False  #: whether it is fixed at its mean instead of estimated
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.mean) and np.isfinite(self.std) and self.std > 0):
@@ -80,22 +71,14 @@ class PressureErrors:
     """Errors of the stated pressures of several closed frames, besides a common factor.
 
     With one closed frame the prior of the factor (``pressure_scale``) covers them.
-
-    Attributes
-    ----------
-    offset_mmHg : float
-        Standard deviation of a common offset, for example of the zero of the measurement from left
-        atrial pressure; 0: none.
-    each_mmHg : float
-        Standard deviation of the independent error of each frame, for example on a steep part of
-        the pressure curve; 0: none.
     """
 
+    #: Standard deviation of a common offset, for example of the zero of the measurement from left
+    #: atrial pressure; 0: none.
     offset_mmHg: PressureError = 5.0
+    #: Standard deviation of the independent error of each frame, for example on a steep part of the
+    #: pressure curve; 0: none.
     each_mmHg: PressureError = 5.0
-
-    def __post_init__(self) -> None:
-        require_numbers(self, "pressures", "offset_mmHg", "each_mmHg", least=0)
 
     def unknowns(self, frames: Iterable[str]) -> tuple[Prior, ...]:
         """The unknown errors of the pressures of these frames."""
@@ -106,32 +89,20 @@ class PressureErrors:
 
 @dataclass(frozen=True, slots=True)
 class CaseMesh:
-    """Meshes of a case.
+    """Meshes of a case."""
 
-    Attributes
-    ----------
-    source : str
-        ``structured``: layers of cells in material coordinates (two leaflets only); ``tetwild``: an
-        unstructured mesh of the thickened leaflets; ``automatic``: structured for two leaflets,
-        otherwise unstructured.
-    columns, rows : int
-        Cells of a structured mesh.
-    guide_columns, guide_rows : int
-        Cells of the coarser guide mesh, which leads the first closure.
-    edge_length : float
-        mm, of an unstructured mesh.
-    contact_columns, contact_rows : int
-        Sample points of contact.
-    """
-
+    #: ``structured``: layers of cells in material coordinates (two leaflets only); ``tetwild``: an
+    #: unstructured mesh of the thickened leaflets; ``automatic``: structured for two leaflets,
+    #: otherwise unstructured.
     source: str = "automatic"
-    columns: CellsAround = 40
-    rows: CellsAlong = 5
+    columns: CellsAround = 40  #: cells of a structured mesh
+    rows: CellsAlong = 5  #: cells of a structured mesh
+    #: Cells of the coarser guide mesh, which leads the first closure.
     guide_columns: CellsAround = 24
     guide_rows: CellsAlong = 3
-    edge_length: EdgeLength = 2.5
-    contact_columns: PointsAround = 144
-    contact_rows: PointsAlong = 32
+    edge_length: EdgeLength = 2.5  #: mm, of an unstructured mesh
+    contact_columns: PointsAround = 144  #: sample points of contact
+    contact_rows: PointsAlong = 32  #: sample points of contact
 
     @property
     def error_share(self) -> float:
@@ -154,81 +125,44 @@ class CaseMesh:
 
 @dataclass(frozen=True, slots=True)
 class PaperSettings:
-    """The paper's filter for the moduli alone, without nuisances.
+    """The paper's filter for the moduli alone, without nuisances."""
 
-    Attributes
-    ----------
-    P0, Q : float
-        MPa², variances of prior and process.
-    R : float
-        mm², variance of an observed coordinate.
-    max_iterations : int
-    """
-
-    P0: Value = 0.01
-    Q: Value = 0.01
-    R: Value = 0.01
+    P0: Value = 0.01  #: MPa², variance of the prior
+    Q: Value = 0.01  #: MPa², variance of the process
+    R: Value = 0.01  #: mm², variance of an observed coordinate
     max_iterations: Count = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaseChoices:
-    """Settings of a personalisation other than unknowns and mechanics.
-
-    Attributes
-    ----------
-    mesh : CaseMesh
-    tolerance : float
-        Of the filter, relative.
-    max_iterations : int
-    largest_change : float
-        Of a parameter's logarithm between equilibria, see
-        :class:`mvest.closure.model.ClosureModel`.
-    paper : PaperSettings or None
-        Also estimate the moduli with the paper's filter.
-    moduli_only : bool
-        Also estimate the moduli with all nuisances fixed.
-    confirm : bool
-        Close the fitted valve anew from the open state, for comparison.
-    errors : ErrorBeliefs or None
-        How well the stated errors are known; they are learned with the unknowns. None: exactly.
-    nuisance_geometry : NuisanceGeometry or None
-        Uncertainty of the model's geometry, which widens the intervals. None: no uncertainty.
-    nuisance_law : dict of str to ExponentialTissue
-        Leaflet -> another law that its tissue may follow, which widens the intervals. Empty: the
-        linear law is right.
-    pressures : PressureErrors or None
-        Errors of the pressures of several fitted closed frames. None: only the common factor, if
-        that is an unknown.
-    """
+    """Settings of a personalisation other than unknowns and mechanics."""
 
     mesh: CaseMesh = field(default_factory=CaseMesh)
-    tolerance: Tolerance = 2e-3
+    tolerance: Tolerance = 2e-3  #: of the filter, relative
     max_iterations: Count = 15
+    #: Of a parameter's logarithm between equilibria (`mvest.closure.model.ClosureModel`).
     largest_change: Logarithm = 0.2
-    paper: PaperSettings | None = None
-    moduli_only: bool = False
-    confirm: bool = False
+    paper: PaperSettings | None = None  #: also estimate the moduli with the paper's filter
+    moduli_only: bool = False  #: also estimate the moduli with all nuisances fixed
+    confirm: bool = False  #: close the fitted valve anew from the open state, for comparison
+    #: How well the stated errors are known; they are learned with the unknowns. None: exactly.
     errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
+    #: Uncertainty of the model's geometry, which widens the intervals. None: no uncertainty.
     nuisance_geometry: NuisanceGeometry | None = None
+    #: Leaflet -> another law that its tissue may follow, which widens the intervals. Empty: the
+    #: linear law is right.
     nuisance_law: dict[str, ExponentialTissue] = field(default_factory=dict)
+    #: Errors of the pressures of several fitted closed frames. None: only the common factor, if
+    #: that is an unknown.
     pressures: PressureErrors | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class PersonaliseSettings(CaseChoices):
-    """Settings of a personalisation.
+    """Settings of a personalisation."""
 
-    Attributes
-    ----------
-    unknowns : tuple of Prior
-        The means of the moduli are the generic values.
-    mechanics : MechanicsSettings
-        The closed frame's pressure replaces that of the protocol.
-    """
-
-    unknowns: tuple[Prior, ...]
-    mechanics: MechanicsSettings
+    unknowns: tuple[Prior, ...]  #: the means of the moduli are the generic values
+    mechanics: MechanicsSettings  #: the closed frame's pressure replaces that of the protocol
 
     def __post_init__(self) -> None:
         IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # checks both
@@ -291,12 +225,8 @@ CURVES = {
 def default_settings(case: ValveCase) -> PersonaliseSettings:
     """Settings that suit the source of a case: surfaces, or a volume with error samples.
 
-    Moduli are in MPa, displacements in mm and degrees.
-
-    Parameters
-    ----------
-    case : ValveCase
-        With an anterior and a posterior leaflet.
+    Moduli are in MPa, displacements in mm and degrees. The case must have an anterior and a
+    posterior leaflet.
     """
     # Leaflets, annulus and tips of one volume are not displaced against each other, and the error
     # samples contain their errors.

@@ -6,8 +6,8 @@ equals estimating the modes with the parameters and reporting the parameters alo
 
 Error samples of a case are complete valves with other open shape, annulus, papillary tips and
 chordae. The linear change of the predicted closed valve (`mvest.closure.rest_geometry`) minus the
-change of its closed frame is one sample of the error of the innovation. Common errors of both
-frames cancel as far as they move the valve as a whole.
+change of its closed frame is one sample of the error of the innovation. Errors that
+move both frames as a whole cancel.
 """
 
 from __future__ import annotations
@@ -48,24 +48,14 @@ TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorSource:
-    """One uncertain property of the valve: independent modes of one standard deviation each.
+    """One uncertain property of the valve: independent modes of one standard deviation each."""
 
-    Attributes
-    ----------
-    columns : ErrorColumns
-        Effect of the modes on the observation, reduced to what noise does not hide.
-    rows : (k, q)
-        Effect of every mode.
-    moves : (f, n, 3, q) mm
-        Effect of every mode on the observed valve, the open frame first.
-    modes : GeometryModes or None
-        Of a geometry; None for law and mesh.
-    """
-
+    #: Effect of the modes on the observation, reduced to what noise does not hide.
     columns: ErrorColumns
-    rows: FloatArray
+    rows: FloatArray  #: (k, q), effect of every mode
+    #: (f, n, 3, q) mm, effect of every mode on the observed valve, the open frame first.
     moves: FloatArray
-    modes: GeometryModes | None = None
+    modes: GeometryModes | None = None  #: of a geometry; None for law and mesh
 
     @property
     def name(self) -> str:
@@ -75,21 +65,11 @@ class ErrorSource:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosedValve:
-    """A closed valve at which errors are linearised.
+    """A closed valve at which errors are linearised."""
 
-    Attributes
-    ----------
-    registered : RegisteredModel
-        Its last closed state is the starting state.
-    m : (p,)
-        Parameters of the closed valve.
-    predicted : array
-        All its frames, stacked.
-    """
-
-    registered: RegisteredModel
-    m: FloatArray
-    predicted: FloatArray
+    registered: RegisteredModel  #: its last closed state is the starting state
+    m: FloatArray  #: (p,), parameters of the closed valve
+    predicted: FloatArray  #: all its frames, stacked
 
     def closure(self) -> tuple[ClosureModel, FloatArray, list[HeldState]]:
         """The closure, its parameters, and the loads of further frames."""
@@ -122,8 +102,6 @@ def geometry_sources(
 
     Parameters
     ----------
-    modes : sequence of GeometryModes
-    valve : ClosedValve
     observation : Observed
         Of the case.
     noise : ObservationNoise
@@ -163,14 +141,8 @@ def law_and_mesh_sources(
     tissue between both laws. The error of the mesh has a share of its difference from the guide
     mesh, if there is one, as standard deviation.
 
-    Parameters
-    ----------
-    tissue : mapping
-        Region -> exponential tissue; only the shape of its curve counts.
-    mesh_share : float
-        0: without mesh errors.
-    valve, observation
-        As of `geometry_sources`.
+    ``tissue`` maps regions to exponential tissues, of which only the shape of the curve counts;
+    ``mesh_share`` 0 leaves mesh errors out.
     """
     model, at, states = valve.closure()
     coarse = model.guide or model
@@ -205,20 +177,10 @@ def law_change(
 ) -> FloatArray | str:
     """Change ``(f, n, 3, q)`` mm of the observed valve by another law, or the reason for failure.
 
-    The frames are the open valve, which stays, the states, and the closed valve.
-
-    Parameters
-    ----------
-    model : ClosureModel
-        On a coarse mesh: closing a fine one without a guide takes as long as an estimation.
-    m : (p,)
-        Parameters of the closure.
-    states : sequence of HeldState
-        Under other loads, reached from the closed valve.
-    tissue : mapping
-        As for `law_and_mesh_sources`.
-    first : sequence of Simulation
-        Closed valve and states with the linear law.
+    The frames are the open valve, which stays, the states (other loads, reached from the closed
+    valve), and the closed valve. The mesh should be coarse: closing a fine one without a guide
+    takes as long as an estimation. ``m (p,)`` are the parameters of the closure, ``first`` closed
+    valve and states with the linear law.
     """
     at = np.asarray(m, dtype=np.float64)
     values = {**model.fixed, **dict(zip(model.names, map(float, at), strict=True))}
@@ -259,19 +221,11 @@ def of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSamples:
-    """Samples of the change of a prediction by measurement errors of the frames it is built from.
+    """Samples of the change of a prediction by errors of the frames it is built from."""
 
-    Attributes
-    ----------
-    predicted : (K, n, 3) mm
-        Displacement of the predicted closed valve.
-    seen, opened : (K, n, 3) mm
-        Displacement of the observed closed and of the open frame in the same samples.
-    """
-
-    predicted: FloatArray
-    seen: FloatArray
-    opened: FloatArray
+    predicted: FloatArray  #: (K, n, 3) mm, displacement of the predicted closed valve
+    seen: FloatArray  #: (K, n, 3) mm, displacement of the observed closed frame
+    opened: FloatArray  #: (K, n, 3) mm, displacement of the open frame
 
     def __len__(self) -> int:
         return len(self.seen)

@@ -55,28 +55,14 @@ class Observed(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Everything an estimation needs except the observation.
+    """Everything an estimation needs except the observation."""
 
-    Attributes
-    ----------
-    parameters : tuple of str, (p,)
-        Names of the unknowns, for example ``E_f.anterior``.
-    model : ObservationModel
-        Predicts all frames, stacked.
-    prior : Gaussian
-        Of the parameters themselves, in their units.
-    filter : Filter
-    transform : Transform
-    tissue : mapping
-        Region -> fixed ratios that give its other moduli.
-    """
-
-    parameters: tuple[str, ...]
-    model: ObservationModel
-    prior: Gaussian
+    parameters: tuple[str, ...]  #: (p,), names of the unknowns, for example ``E_f.anterior``
+    model: ObservationModel  #: predicts all frames, stacked
+    prior: Gaussian  #: of the parameters themselves, in their units
     filter: Filter
     transform: Transform
-    tissue: Mapping[str, TissueSettings]
+    tissue: Mapping[str, TissueSettings]  #: region -> fixed ratios that give its other moduli
 
     def __post_init__(self) -> None:
         if self.prior.size != len(self.parameters):
@@ -93,40 +79,21 @@ class Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyResult:
-    """An estimate from an observation, or the reason for its absence.
+    """An estimate from an observation, or the reason for its absence."""
 
-    Attributes
-    ----------
-    parameters : tuple of str, (p,)
-    tissue : mapping
-        Region -> fixed ratios; empty for models without tissue.
-    observation : Observed or None
-        None if it could not be simulated.
-    filtered : Estimate or None
-        What the filter returned; None if it never ran.
-    identifiability : Identifiability or None
-        Cramér-Rao bound and flat directions of the data alone, at the estimate.
-    reason, detail : str
-    converged : bool
-    seconds : float
-        Wall-clock time of the estimation.
-    fitted : (f, n, 3) mm or None
-        Observed frames as predicted at the estimate, with unobserved vertices.
-    truth : Truth or None
-        Added by ``against``, after the estimation.
-    """
-
-    parameters: tuple[str, ...]
-    tissue: Mapping[str, TissueSettings]
-    observation: Observed | None
-    filtered: Estimate | None
+    parameters: tuple[str, ...]  #: (p,)
+    tissue: Mapping[str, TissueSettings]  #: region -> fixed ratios; empty for models without tissue
+    observation: Observed | None  #: None if it could not be simulated
+    filtered: Estimate | None  #: what the filter returned; None if it never ran
+    #: Cramér-Rao bound and flat directions of the data alone, at the estimate.
     identifiability: Identifiability | None
     reason: str
     detail: str
     converged: bool
-    seconds: float
+    seconds: float  #: wall-clock time of the estimation
+    #: (f, n, 3) mm, observed frames as predicted at the estimate, with unobserved vertices.
     fitted: FloatArray | None = None
-    truth: Truth | None = None
+    truth: Truth | None = None  #: added by ``against``, after the estimation
 
     def __str__(self) -> str:
         if self.filtered is None or self.estimate is None:
@@ -200,7 +167,6 @@ def expected_intervals(
     Parameters
     ----------
     names : sequence of str, (p,)
-    transform : Transform
     generic : (p,)
     before, after : (p,)
         Standard deviations in filter coordinates.

@@ -23,83 +23,41 @@ POINTS = "observed_points_"
 NEEDED = ("triangles", "region", "rest", "annulus", "seen")
 """Arrays that every case has."""
 NO_INDEX: IntArray = np.empty(0, dtype=np.int64)
-SHAPES: Mapping[str, tuple[type, tuple[str | int, ...]]] = {
-    "seen": (bool, ("f",)),
-    "triangles": (np.int64, ("m", 3)),
-    "region": (np.int64, ("m",)),
-    "rest": (np.float64, ("n", 3)),
-    "annulus": (np.int64, ("a",)),
-    "free_edge": (np.int64, ("e",)),
-    "tips": (np.float64, ("f + 1", "t", 3)),
-    "chord_tip": (np.int64, ("c",)),
-    "chord_insertion": (np.int64, ("c",)),
-    **dict.fromkeys(("observed", "generic", "fitted"), (np.float64, ("f", "n", 3))),
-    **dict.fromkeys(("distance_generic", "distance_fitted"), (np.float64, ("f", "n"))),
-}
-"""Type and shape of each array; equal letters are equal lengths, f is the number of frames."""
-INDEXED = {"triangles": "n", "annulus": "n", "free_edge": "n", "chord_insertion": "n",
-           "chord_tip": "t"}  # fmt: skip
-"""Index arrays -> the length that bounds them."""
 TURNED = ("rest", "tips", "observed", "generic", "fitted")
+TYPES: Mapping[str, type] = {
+    "seen": bool,
+    **dict.fromkeys(("triangles", "region", "annulus", "free_edge"), np.int64),
+    **dict.fromkeys(("chord_tip", "chord_insertion"), np.int64),
+    **dict.fromkeys((*TURNED, "distance_generic", "distance_fitted"), np.float64),
+}
+"""Array -> type of its elements."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseFields:
-    """A valve at rest, with its observed and predicted shapes in ``f`` further frames.
+    """A valve at rest, with its observed and predicted shapes in ``f`` further frames."""
 
-    Attributes
-    ----------
-    triangles, region, rest, annulus, free_edge, seen, tips, chord_tip, chord_insertion : ndarray
-        With the shapes of `SHAPES`: of the open valve in the reference frame (mm), loops in order,
-        whether the filter received a frame, papillary tips in the reference frame and then in the
-        others (mm), and the tip and the vertex of each chord.
-    frames : tuple of str
-        ``f`` names, without the reference frame.
-    observed, generic, fitted : ndarray or None
-        ``(f, n, 3)`` mm; NaN for unobserved vertices.
-    observed_points : mapping
-        ``(q, 3)`` mm for a frame without correspondence to the reference frame.
-    distance_generic, distance_fitted : ndarray or None
-        ``(f, n)`` mm from the observation; NaN for unobserved vertices.
-    reach_mm : float or None
-        Distance of midsurfaces below which leaflets touch.
-    """
-
-    triangles: IntArray
-    region: IntArray
-    rest: FloatArray
-    annulus: IntArray
-    frames: tuple[str, ...]
-    seen: BoolArray
-    tips: FloatArray
+    triangles: IntArray  #: (m, 3)
+    region: IntArray  #: (m,), leaflet of each triangle
+    rest: FloatArray  #: (n, 3) mm, the open valve in the reference frame
+    annulus: IntArray  #: (k,), vertices in loop order
+    frames: tuple[str, ...]  #: ``f`` names, without the reference frame
+    seen: BoolArray  #: (f,), whether the filter received a frame
+    tips: FloatArray  #: (f + 1, t, 3) mm, papillary tips, in the reference frame first
+    #: ``(q, 3)`` mm for a frame without correspondence to the reference frame.
     observed_points: Mapping[str, FloatArray]
-    free_edge: IntArray = field(default_factory=lambda: NO_INDEX)
+    free_edge: IntArray = field(default_factory=lambda: NO_INDEX)  #: (k,), vertices in loop order
+    #: (c,), tip and vertex of each chord.
     chord_tip: IntArray = field(default_factory=lambda: NO_INDEX)
+    #: (c,), tip and vertex of each chord.
     chord_insertion: IntArray = field(default_factory=lambda: NO_INDEX)
-    observed: FloatArray | None = None
-    generic: FloatArray | None = None
-    fitted: FloatArray | None = None
+    observed: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
+    generic: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
+    fitted: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
+    #: ``(f, n)`` mm from the observation; NaN for unobserved vertices.
     distance_generic: FloatArray | None = None
     distance_fitted: FloatArray | None = None
-    reach_mm: float | None = None
-
-    def __post_init__(self) -> None:
-        f = len(self.frames)
-        if not f:
-            raise InputError("a case without frames, expected at least one")
-        lengths: dict[str | int, int] = {3: 3, "f": f, "f + 1": f + 1}
-        for name, (_, letters) in SHAPES.items():
-            if (array := getattr(self, name)) is None:
-                continue
-            # The first array with a letter defines its length.
-            lengths = dict(zip(letters, array.shape, strict=False)) | lengths
-            expected = tuple(lengths.get(letter) for letter in letters)
-            if array.shape != expected:
-                raise InputError(f"{name} has the shape {array.shape}, expected {expected}")
-        for name, letter in INDEXED.items():
-            index, end = getattr(self, name), lengths[letter]
-            if index.size and not 0 <= index.min() <= index.max() < end:
-                raise InputError(f"{name} has indices outside 0 to {end - 1}")
+    reach_mm: float | None = None  #: distance of midsurfaces below which leaflets touch
 
     @property
     def closed(self) -> int:
@@ -119,7 +77,7 @@ class CaseFields:
 
 
 def as_stored(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Arrays in the types that runs store: int32 indices, single precision positions."""
+    """Arrays as runs store them: int32 indices, single precision positions."""
     stored = {name: np.asarray(values) for name, values in arrays.items()}
     for name, values in stored.items():
         if values.dtype.kind == "i":
@@ -152,15 +110,15 @@ def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> Cas
     Parameters
     ----------
     arrays : mapping or Path
-        At least ``triangles``, ``region``, ``rest``, ``annulus``, ``frames`` and ``seen``; the
-        others as in `CaseFields`, and ``observed_points_<frame>``. Or their ``.npz`` file.
+        `NEEDED` and ``frames``; the others as in `CaseFields`, and ``observed_points_<frame>``. Or
+        their ``.npz`` file.
     turned : bool
         False: keep the axes of the case.
 
     Raises
     ------
     InputError
-        If arrays cannot be read, are missing, or do not fit each other.
+        If arrays are missing or cannot be read.
     """
     where = "arrays"
     try:
@@ -169,7 +127,7 @@ def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> Cas
             arrays = read_npz(arrays, where=arrays.name)
         values: dict[str, Any] = {
             name: np.asarray(arrays[name], dtype=kind)
-            for name, (kind, _) in SHAPES.items()
+            for name, kind in TYPES.items()
             if name in arrays or name in NEEDED
         }
         frames = tuple(map(str, arrays["frames"]))

@@ -56,39 +56,24 @@ class Spread(Frozen):
 
 
 class Unknown(Frozen):
-    """One unknown before and after the estimation, in its unit.
+    """One unknown before and after the estimation, in its unit."""
 
-    Attributes
-    ----------
-    name, label, unit : str
-        For example ``E_f.anterior``, its readable name, and its unit (empty for a factor).
-    kind : {"modulus", "nuisance", "derived", "quantity"}
-        A derived modulus follows from an estimated one by a fixed ratio; a quantity is a ratio of
-        moduli or a strain (%).
-    treatment : {"estimated", "fixed"}
-    prior_mean, prior_std : float or None
-    estimate, std : float or None
-    low, high : float or None
-        Ends of the 95 % interval.
-    bound : float or None
-        Cramér-Rao standard deviation of the data alone; None if they do not determine it.
-    truth : float or None
-        Of simulated valves; added after the estimation.
-    """
-
-    name: str
-    label: str = ""
-    unit: str = ""
+    name: str  #: for example ``E_f.anterior``
+    label: str = ""  #: readable name
+    unit: str = ""  #: empty for a factor
+    #: A derived modulus follows from an estimated one by a fixed ratio; a quantity is a ratio of
+    #: moduli or a strain (%).
     kind: Literal["modulus", "nuisance", "derived", "quantity"] = "modulus"
     treatment: Literal["estimated", "fixed"] = "estimated"
     prior_mean: float | None = None
     prior_std: float | None = None
     estimate: float | None = None
     std: float | None = None
-    low: float | None = None
-    high: float | None = None
+    low: float | None = None  #: end of the 95 % interval
+    high: float | None = None  #: end of the 95 % interval
+    #: Cramér-Rao standard deviation of the data alone; None if they do not determine it.
     bound: float | None = None
-    truth: float | None = None
+    truth: float | None = None  #: of simulated valves; added after the estimation
 
     @property
     def region(self) -> str:
@@ -123,21 +108,11 @@ class Unknown(Frozen):
 
 
 class FrameFit(Frozen):
-    """Distances (mm) of the models from an observed frame and, if simulated, from the true one.
-
-    Attributes
-    ----------
-    frame : str
-    seen : bool
-        Whether the filter received this frame.
-    generic, registered, personalised : Spread
-        Models as in `mvest.personalisation.result.FrameComparison`.
-    generic_to_truth, registered_to_truth, personalised_to_truth : Spread or None
-    """
+    """Distances (mm) of the models from an observed frame and, if simulated, from the true one."""
 
     frame: str
-    seen: bool
-    generic: Spread
+    seen: bool  #: whether the filter received this frame
+    generic: Spread  #: models as in `mvest.personalisation.result.FrameComparison`
     registered: Spread
     personalised: Spread
     generic_to_truth: Spread | None = None
@@ -146,69 +121,36 @@ class FrameFit(Frozen):
 
 
 class EstimateRecord(Frozen):
-    """One estimate, or the reason for its absence.
+    """One estimate, or the reason for its absence."""
 
-    Attributes
-    ----------
-    case : str
-        Name of the case; empty for a synthetic study.
-    seed : int or None
-        Of the observation errors.
-    simulated : bool or None
-        Whether the observation is stated as simulated.
-    status : {"converged", "failed"}
-    reason, detail : str
-        Why the estimation ended.
-    verdict : Verdict or None
-        None if nothing was judged.
-    unknowns : tuple of Unknown
-    correlation : (p, p)
-        Posterior correlation of the unknowns in filter coordinates; may be empty.
-    distance_mm, distance_to_truth_mm : Spread or None
-        From the fitted vertices of the last observed frame to the observed and the true ones.
-    frames : tuple of FrameFit
-    innovation : InnovationSummary or None
-    condition_number : float or None
-        Of the information of the data alone.
-    flat : tuple of str
-        Combinations of unknowns that the data hardly determine.
-    confounded : tuple of TradeOff
-        Parameters that the data hardly distinguish.
-    iterations, forward_solves : int or None
-    iterates, iterate_std : (i, p)
-    objective : (i,)
-    seconds : float or None
-        Wall-clock time of the estimation.
-    alternatives : mapping
-        Name -> another estimate from the same data: ``moduli_only`` with all nuisances fixed,
-        ``paper`` by the paper's method.
-    details : mapping
-        Name -> rows of plain data for reports (see `mvest.personalisation.record`).
-    """
-
-    case: str = ""
-    seed: int | None = None
-    simulated: bool | None = None
+    case: str = ""  #: name of the case; empty for a synthetic study
+    seed: int | None = None  #: of the observation errors
+    simulated: bool | None = None  #: whether the observation is stated as simulated
     status: Literal["converged", "failed"]
-    reason: str
-    detail: str = ""
-    verdict: Verdict | None = None
+    reason: str  #: why the estimation ended
+    detail: str = ""  #: why the estimation ended
+    verdict: Verdict | None = None  #: None if nothing was judged
     unknowns: tuple[Unknown, ...] = ()
+    #: (p, p), posterior correlation of the unknowns in filter coordinates; may be empty.
     correlation: tuple[Numbers, ...] = ()
+    #: From the fitted vertices of the last observed frame to the observed and the true ones.
     distance_mm: Spread | None = None
     distance_to_truth_mm: Spread | None = None
     frames: tuple[FrameFit, ...] = ()
     innovation: InnovationSummary | None = None
-    condition_number: float | None = None
-    flat: tuple[str, ...] = ()
-    confounded: tuple[TradeOff, ...] = ()
+    condition_number: float | None = None  #: of the information of the data alone
+    flat: tuple[str, ...] = ()  #: combinations of unknowns that the data hardly determine
+    confounded: tuple[TradeOff, ...] = ()  #: parameters that the data hardly distinguish
     iterations: int | None = None
     forward_solves: int | None = None
-    iterates: tuple[Numbers, ...] = ()
-    iterate_std: tuple[Numbers, ...] = ()
-    objective: Numbers = ()
-    seconds: float | None = None
+    iterates: tuple[Numbers, ...] = ()  #: (i, p)
+    iterate_std: tuple[Numbers, ...] = ()  #: (i, p)
+    objective: Numbers = ()  #: (i,)
+    seconds: float | None = None  #: wall-clock time of the estimation
+    #: Name -> another estimate from the same data: ``moduli_only`` with all nuisances fixed,
+    #: ``paper`` by the paper's method.
     alternatives: Mapping[str, EstimateRecord] = {}
+    #: Name -> rows of plain data for reports (see `mvest.personalisation.record`).
     details: Mapping[str, tuple[Row, ...]] = {}
 
     @property
@@ -249,12 +191,9 @@ class EstimateRecord(Frozen):
         return self.model_copy(update={**nothing, "details": details, "alternatives": others})
 
     def with_truth(self, truth: Mapping[str, float]) -> EstimateRecord:
-        """A copy with true values, also for derived moduli and the alternatives.
+        """A copy with true values by name, also for derived moduli and the alternatives.
 
-        Parameters
-        ----------
-        truth : mapping
-            Name -> value; unknowns without an entry stay as they are.
+        Unknowns without an entry stay as they are.
         """
         known = dict(truth)
         for unknown in self.unknowns:

@@ -44,37 +44,20 @@ def entry_of(
 ) -> Entry[T]:
     """The cache entry of what ``made_by`` makes from ``described``.
 
-    Parameters
-    ----------
-    folder : Path
-        Created with the first entry.
-    described : mapping
-        Plain values: everything that decides the content, except the code.
-    made_by : tuple
-        Modules, functions or classes that make and write it; their imports count too.
-    read : callable
-        Reads a path, or refuses it.
-    name : str
-        Of the file or folder, with ``{key}``.
+    ``described`` holds plain values: everything that decides the content, except the code. That is
+    ``made_by``: modules, functions or classes, with their imports. ``read`` reads a path or refuses
+    it. ``name`` is that of the file or folder; the folder is created with the first entry.
     """
     return Entry(folder / name.format(key=key_of(described, made_by)), read)
 
 
 @dataclass(frozen=True, slots=True)
 class StoredModel:
-    """A model with a disk cache of its converged predictions, without derivatives.
-
-    Attributes
-    ----------
-    model : ObservationModel
-    folder : Path
-    key : str
-        From :func:`key_of`; the parameters are added to it.
-    """
+    """A model with a disk cache of its converged predictions, without derivatives."""
 
     model: ObservationModel
     folder: Path
-    key: str
+    key: str  #: from :func:`key_of`; the parameters are added to it
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Prediction at ``m (p,)``; its Jacobian is zero if it was read from disk.
@@ -103,17 +86,11 @@ class Extrapolated:
 
     Richardson 1911, Phil. Trans. R. Soc. A 210:307. Closed valves of quadratic tetrahedra converge
     with nearly order one: leaflets bend sharply at contact, and chordae and annulus pull at lines.
-
-    Attributes
-    ----------
-    fine, coarse : StoredModel
-    share : float
-        Cell size of the fine mesh over that of the coarse one.
     """
 
     fine: StoredModel
     coarse: StoredModel
-    share: float
+    share: float  #: cell size of the fine mesh over that of the coarse one
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Prediction at ``m (p,)``, without derivatives."""

@@ -16,19 +16,11 @@ from mvest.typing import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """The origin of a synthetic observation.
+    """The origin of a synthetic observation."""
 
-    Attributes
-    ----------
-    parameters : tuple of str, (p,)
-    values : (p,) in the units of the parameters
-    positions : (f, n, 3) mm
-        The observed frames without noise.
-    """
-
-    parameters: tuple[str, ...]
-    values: FloatArray
-    positions: FloatArray
+    parameters: tuple[str, ...]  #: (p,)
+    values: FloatArray  #: (p,) in the units of the parameters
+    positions: FloatArray  #: (f, n, 3) mm, the observed frames without noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +60,6 @@ def simulate_observation(
         Of the errors, as the filter assumes it; None for independent errors.
     errors : sequence of ObservationError
         Applied to the truth in this order.
-    rng : numpy.random.Generator
 
     Raises
     ------

@@ -33,43 +33,23 @@ LEVELS: tuple[Trust, ...] = (TRUSTWORTHY, DOUBTFUL, NONE)
 
 @dataclass(frozen=True, slots=True)
 class FailedCheck:
-    """A failed check of an estimate.
+    """A failed check of an estimate."""
 
-    Attributes
-    ----------
-    check : str
-        Its name.
-    trust : Trust
-        The best verdict that it admits.
-    text : str
-        What was found, with its number and the expected one.
-    advice : str
-        What to do next.
-    """
-
-    check: str
-    trust: Trust
-    text: str
-    advice: str = ""
+    check: str  #: its name
+    trust: Trust  #: the best verdict that it admits
+    text: str  #: what was found, with its number and the expected one
+    advice: str = ""  #: what to do next
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The trust in an estimate and its reasons.
-
-    Attributes
-    ----------
-    trust : Trust
-    failed_checks : tuple of FailedCheck
-        The gravest first; empty for a trustworthy estimate.
-    passed, missing : tuple of str
-        Names of the checks that it passed, and of those without data.
-    """
+    """The trust in an estimate and its reasons."""
 
     trust: Trust
+    #: The gravest first; empty for a trustworthy estimate.
     failed_checks: tuple[FailedCheck, ...] = ()
-    passed: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
+    passed: tuple[str, ...] = ()  #: names of the checks that it passed
+    missing: tuple[str, ...] = ()  #: names of the checks without data
 
     def __str__(self) -> str:
         if not self.failed_checks:
@@ -88,14 +68,7 @@ def texts(*found: str) -> Found:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One table of ``checks.toml``; see its head.
-
-    Attributes
-    ----------
-    name : str
-    limits : two numbers
-    text, advice : str
-    """
+    """One table of ``checks.toml``; see its head."""
 
     name: str
     limits: Sequence[float]

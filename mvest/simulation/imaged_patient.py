@@ -17,7 +17,6 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.problem.registration import REGISTRATION
-from mvest.quantities import Length
 from mvest.simulation.motion import DrawnValve, MotionSettings, closing_frames, moving_valve
 from mvest.simulation.virtual_patient import PatientSimulation, close_patient
 from mvest.typing import FloatArray
@@ -32,14 +31,6 @@ IMAGED = PatientSimulation(
     held_tips=(0.0, 0.0, 0.0),
 )
 """How these patients are closed. The settings of the observation are not used."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EchoSettings:
-    """How a virtual patient for imaging moves, and how the volume is simulated."""
-
-    spread: str = "training"  #: of acquisitions; shifted: outside the training of the detectors
-    tip_motion_mm: tuple[Length, Length] = (1.0, 3.0)  #: of papillary tips
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,34 +39,25 @@ ANNULUS_LENGTH_MM = 20.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Misspecification:
-    """Differences from what a case states and an estimator assumes; by default none.
+    """Differences from what a case states and an estimator assumes; by default none."""
 
-    Attributes
-    ----------
-    kernel : str
-        Of the smooth errors: ``matern`` (of smoothness 3/2, as assumed), ``exponential`` (rougher)
-        or ``gaussian`` (smoother).
-    exponential : mapping
-        Region -> tissue of the exponential law that replaces the linear one, its stresses scaled to
-        that one's (see `mechanics`); empty: the linear law.
-    leaflet_scale : float
-        Relative error of one leaflet's length from the annulus in the open frame, too long. The
-        leaflet is drawn at random.
-    """
-
+    #: Of the smooth errors: ``matern`` (of smoothness 3/2, as assumed), ``exponential`` (rougher)
+    #: or ``gaussian`` (smoother).
     kernel: str = "matern"
     length_factor: Factor = 1.0  #: on the stated correlation length of the smooth errors
     annulus_mm: Length = 0.0  #: SD of each coordinate of a smooth error of the closed annulus
     tips_mm: Length = 0.0  #: the same of the tips, equal in the open and the closed frame
     pressure_off: Share = 0.0  #: relative error, up or down at random
     thickness_off: Share = 0.0  #: the same of the thickness
-    missing: Share = (
-        0.0  # share of the closed leaflets not seen, a patch that is filled in smoothly
-    )
+    missing: Share = 0.0  #: share of the closed leaflets not seen: a patch, filled in smoothly
     outliers: Share = 0.0  #: share of the vertices of the closed leaflets that are outliers
     outlier_mm: Length = 4.0  #: SD of each coordinate of their errors
+    #: Region -> tissue of the exponential law that replaces the linear one, its stresses scaled to
+    #: that one's (see `mechanics`); empty: the linear law.
     exponential: Mapping[str, ExponentialTissue] = field(default_factory=dict)
     prestretch: Stretch = 1.0  #: length of open leaflets in their plane over that free of stress
+    #: Relative error of one leaflet's length from the annulus in the open frame, too long. The
+    #: leaflet is drawn at random.
     leaflet_scale: Share = 0.0
     frame_scale: Share = 0.0  #: relative error of the size of the open frame, too large
 

@@ -53,29 +53,20 @@ class RefusedError(GeometryError):
 
 @dataclass(frozen=True, slots=True)
 class MotionLimits:
-    """Motions beyond these limits are refused. The values are choices.
+    """Motions beyond these limits are refused. The values are choices."""
 
-    Attributes
-    ----------
-    orifice : float
-        Share of the open valve's orifice that midsurfaces may leave open in the closed one. A
-        closed valve leaves some 5 %, as midsurfaces keep a thickness apart; a tethered one more.
-    edge_gap : float
-        mm between the free edges of the closed valve, the median over its middle half. If a leaflet
-        closed first and holds the other one below it, the gap is some 9 mm; otherwise 1 to 5 mm.
-    edge_height : float
-        mm by which the free edge of the closed valve may rise above its annulus plane.
-    stretch : float
-        Length of an edge of the layout over its length in the open valve; at most one edge in a
-        hundred may be longer.
-    crossings : int
-        Pairs of intersecting triangles in any frame. The layout is finer than contact is sampled.
-    """
-
+    #: Share of the open valve's orifice that midsurfaces may leave open in the closed one. A closed
+    #: valve leaves some 5 %, as midsurfaces keep a thickness apart; a tethered one more.
     orifice: Factor = 0.15
+    #: mm, between the free edges of the closed valve, the median over its middle half. If a leaflet
+    #: closed first and holds the other one below it, the gap is some 9 mm; otherwise 1 to 5 mm.
     edge_gap: Place = 7.0
+    #: mm, by which the free edge of the closed valve may rise above its annulus plane.
     edge_height: Place = 0.0
+    #: Length of an edge of the layout over its length in the open valve; at most one edge in a
+    #: hundred may be longer.
     stretch: Factor = 1.6
+    #: Pairs of intersecting triangles in any frame. The layout is finer than contact is sampled.
     crossings: Count = 4
 
 

@@ -54,27 +54,13 @@ PIXEL_MM = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One volume to be simulated.
+    """One volume to be simulated."""
 
-    Attributes
-    ----------
-    kind : str
-        One of :data:`KINDS`.
-    number : int
-        Among those of its kind.
-    seed : int
-        Of the study.
-    acquisition : Acquisition
-        Acquisitions are drawn about it.
-    closed : int
-        Number of the closed frame of its valve; the first one is open.
-    """
-
-    kind: str
-    number: int
-    seed: int
-    acquisition: Acquisition
-    closed: int
+    kind: str  #: one of :data:`KINDS`
+    number: int  #: among those of its kind
+    seed: int  #: of the study
+    acquisition: Acquisition  #: acquisitions are drawn about it
+    closed: int  #: number of the closed frame of its valve; the first one is open
 
     @property
     def spread(self) -> Setting:

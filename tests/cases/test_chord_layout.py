@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.cases.case import Role
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
-from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import band_grid
@@ -107,8 +105,6 @@ def test_frames_without_correspondence_are_matched(tmp_path):
     save_frames(tmp_path, columns=56, rows=14, names=["closed"])
     case = read_case(save(tmp_path, document))
     assert not case.frames[1].corresponds
-    assert sum("annulus of frame 'closed'" in sentence for sentence in case.derived) == 1
-    assert sum("material coordinates" in sentence for sentence in case.derived) == 1
     # The motion shrinks x by 1 % and y by 6 %, so shares of arc length are not quite material: two
     # halves of an arc L that shrink differently by e move its middle by e L / 4, and the
     # posterior arc is 62 mm long. A vertex is 2.5 mm from its neighbours.
@@ -119,7 +115,6 @@ def test_frames_without_correspondence_are_matched(tmp_path):
     np.testing.assert_allclose(
         case.chordae.rest_length, expected.chordae.rest_length, atol=0.056 * 62 / 4
     )
-    assert case.valve.motion.annulus.shape == (2, 40, 3)
 
 
 @pytest.fixture
@@ -132,34 +127,10 @@ def test_an_open_frame_alone_comes_back_as_it_was_written(tmp_path, anatomy):
     back = read_case(write_case(tmp_path / "case", anatomy))
     assert_equal(back, anatomy, "sha256")
     assert back.closed is None
-    assert str(back).splitlines()[2] == "frames: open (reference, -0.333 mmHg)"
     # Its boundary stays where it is.
     motion = back.valve.motion
     for positions in (motion.annulus, motion.papillary_tips):
         np.testing.assert_array_equal(positions[0], positions[1])
-
-
-def test_the_closed_frame_is_asked_for_in_one_line(anatomy):
-    with pytest.raises(InputError, match=r"case template: no closed frame.*valve=folder") as raised:
-        anatomy.frame(Role.CLOSED)
-    assert "\n" not in str(raised.value)
-    held = replace(template_case(40, 12).frames[1], time=0.5)
-    with pytest.raises(InputError, match="0 frames have the role closed"):
-        replace(anatomy, frames=(*anatomy.frames, held))
-
-
-def test_chordae_of_an_open_frame_alone_are_long_enough_to_close_it(tmp_path):
-    document = plain_folder(tmp_path / "case", 40, 12)
-    document["frames"] = document["frames"][:1]
-    del document["chordae"]
-    case = read_case(save(tmp_path / "case", document))
-    assert any("an assumed closure: the free edges meet" in each for each in case.derived)
-    # By the slack that the template gives them at a closure that is intended, as this one is.
-    band, frame = band_of(case), case.frames[0]
-    goal = assumed_closure(band, frame.annulus, frame.papillary_tips)
-    tips = frame.papillary_tips
-    expected = lay_out_chordae(band, tips, goal, tips, ChordLayout()).rest_length
-    np.testing.assert_allclose(case.chordae.rest_length, expected, rtol=1e-9)
 
 
 def test_an_assumed_closure_brings_the_edges_together(anatomy):

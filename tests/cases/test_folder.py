@@ -1,13 +1,15 @@
-"""A case comes back as it was written, and in whatever form general mesh libraries export it."""
+"""A case comes back as it was written; its units, derived values and errors of the vertices."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
+from mvest.cases.case import ErrorSamples, Role, Uncertainty
 from mvest.cases.folder import (
     read_case,
     write_case,
+    write_error_samples,
 )
 from mvest.errors import InputError
 from mvest.valve.anatomy.template import Template
@@ -49,9 +51,6 @@ def test_a_case_comes_back_as_it_was_written(tmp_path):
 
 def test_nothing_is_left_of_a_case_that_cannot_be_written(tmp_path):
     case = template_case(16, 5)
-    moved = dataclasses.replace(case.frames[0], vertices=case.frames[0].vertices + 1.0)
-    with pytest.raises(InputError, match="vertices of the reference frame 'open'"):
-        write_case(tmp_path / "a", dataclasses.replace(case, frames=(moved, *case.frames[1:])))
     wrong = dataclasses.replace(case.frames[2], vertices=case.frames[2].vertices * np.nan)
     with pytest.raises(InputError, match="not finite"):
         write_case(tmp_path / "a", dataclasses.replace(case, frames=(*case.frames[:2], wrong)))
@@ -76,11 +75,6 @@ def test_the_hash_changes_with_every_file_that_is_used_and_no_other(tmp_path):
         assert read_case(folder).sha256 != first, file.name
         file.write_bytes(content)
     assert read_case(folder).sha256 == first
-    # What moves from the end of one file to the beginning of the next is no longer the same case.
-    one, following = folder / "frame_01_annulus.csv", folder / "frame_01_free_edge.csv"
-    one.write_text(one.read_text().removesuffix("\n"))
-    following.write_text("\n" + following.read_text())
-    assert read_case(folder).sha256 != first
 
 
 # --- units and what is derived ------------------------------------------------------------------
@@ -144,19 +138,97 @@ def test_fibres_run_round_the_valve_unless_given(tmp_path):
     assert np.median(cosine) > 0.98
 
 
-def test_pressures_come_from_the_curve_where_they_are_not_given(tmp_path):
-    document = plain_folder(tmp_path)
-    for entry, time in zip(document["frames"], (0.40, 0.65), strict=True):
-        entry["time"] = time
-        del entry["pressure"]
-    case = read_case(save(tmp_path, document))
-    # LV 6 - LA 7 at 0.40 s; a plateau near 120 mmHg in systole.
-    assert case.frames[0].pressure_mmHg == pytest.approx(-1.0)
-    assert 110 < case.frames[1].pressure_mmHg < 125
-    assert sum("generic transmitral curve" in sentence for sentence in case.derived) == 2
-    (tmp_path / "p.csv").write_text("time,pressure\n0.3,-2\n0.5,10\n0.7,15.0\n")
-    document |= {"pressure_curve": "p.csv", "units": {"length": "mm", "pressure": "kPa"}}
-    document["frames"][1]["time"] = 0.7
-    case = read_case(save(tmp_path, document))
-    assert case.frames[1].pressure_mmHg == pytest.approx(15.0 / 0.133322387415)
-    assert not any("pressure" in sentence for sentence in case.derived)
+NAMES = ["open", "closed"]
+
+
+def corresponding(columns=16, rows=5):
+    case = template_case(columns, rows)
+    frames = tuple(dataclasses.replace(frame, corresponds=True) for frame in case.frames)
+    return dataclasses.replace(case, frames=frames)
+
+
+def samples(count=5, frames=2, n=80, tips=2, seed=1):
+    rng = np.random.default_rng(seed)
+    return ErrorSamples(
+        0.5 * rng.standard_normal((count, frames, n, 3)),
+        rng.standard_normal((count, frames, tips, 3)),
+    )
+
+
+def test_what_a_case_states_of_its_errors_comes_back_as_it_was_written(tmp_path):
+    case, change = corresponding(), dataclasses.replace
+    n = len(case.surface.vertices)
+    std = np.random.default_rng(2).uniform(0.2, 1.0, n)
+    own = change(samples(6, 3, n), source=np.array([0, 1, 2, 0, 1, 2]))
+    known = change(case, uncertainty=Uncertainty(std, 8.0), error_samples=own, chordae_follow=True)
+    back = read_case(write_case(tmp_path / "case", known))
+    assert_equal(back.uncertainty, known.uncertainty)
+    assert_equal(back.error_samples, own)
+    assert back.chordae_follow
+    # A case that states nothing of this is written without it.
+    plain = read_case(write_case(tmp_path / "plain", case))
+    assert (plain.error_samples, plain.chordae_follow) == (None, False)
+    with pytest.raises(InputError, match=r"source is float64 .* expected integers of shape \(6,\)"):
+        change(own, source=np.zeros(6))
+
+
+def test_deviations_that_are_not_positive_are_refused():
+    assert Uncertainty(np.array([0.3, 0.4, 1.2])).typical_mm == pytest.approx(np.sqrt(1.69 / 3))
+    with pytest.raises(InputError, match="std_mm = 0 at vertex 1"):
+        Uncertainty(np.array([0.5, 0.0, 0.5]))
+    with pytest.raises(InputError, match=r"shape \(3, 2\)"):
+        Uncertainty(np.ones((3, 2)))
+
+
+def test_deviations_and_samples_must_be_of_the_case():
+    case, change = corresponding(), dataclasses.replace
+    n = len(case.surface.vertices)
+
+    def without(role):
+        """The case with a frame that does not correspond."""
+        frames = (change(f, corresponds=f.role is not role) for f in case.frames)
+        return change(case, frames=tuple(frames))
+
+    for wrong, change_of_it, message in (
+        (case, {"uncertainty": Uncertainty(np.ones(3))}, f"std_mm of 3 vertices, expected {n}"),
+        (case, {"error_samples": samples()}, "vertices of 2 frames of 80 points, expected 3 of 80"),
+        (case, {"error_samples": samples(5, 3, 80, 1)}, "tips of 3 frames of 1 points, expected 3"),
+        (without(Role.HELD_OUT), {"error_samples": samples(5, 3)}, "'held' do not correspond"),
+        (without(Role.CLOSED), {"uncertainty": Uncertainty(np.ones(n))}, "expected one number"),
+    ):
+        with pytest.raises(InputError, match=message):
+            change(wrong, **change_of_it)
+
+
+MOVES, TIP_MOVES = np.zeros((5, 2, 80, 3)), np.zeros((5, 2, 2, 3))
+GOOD = {"frames": np.array(NAMES), "vertices": MOVES, "tips": TIP_MOVES}
+
+
+def folder_with(tmp_path, **arrays):
+    document = plain_folder(tmp_path, 16, 5)
+    document["observation"] = {
+        "std_mm": 0.5, "correlation_length_mm": 8.0, "error_samples": "errors.npz"
+    }  # fmt: skip
+    if arrays:
+        np.savez(tmp_path / "errors.npz", **arrays)
+    else:
+        write_error_samples(tmp_path / "errors.npz", samples(), NAMES)
+    return save(tmp_path, document)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frames": np.array(["closed", "open"])}, r"frames \['closed', 'open'\], expected"),
+        ({"frames": np.array(NAMES, dtype=object)}, "plain arrays"),
+        ({"vertices": np.zeros((5, 2, 81, 3))}, "vertices of 2 frames of 81 points"),
+        ({"vertices": MOVES[..., 0]}, r"is float64 of shape \(5, 2, 80\)"),
+        ({"vertices": MOVES + 25.0}, "at most 20 mm"),
+        ({"tips": TIP_MOVES * np.nan}, "tips has values that are"),
+        ({"tips": TIP_MOVES[:4]}, "expected as many"),
+        ({"vertices": MOVES[:3], "tips": TIP_MOVES[:3]}, "3 error samples, expected 4 to 500"),
+    ],
+)
+def test_a_file_of_other_samples_is_refused(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        read_case(folder_with(tmp_path, **{**GOOD, **change}))

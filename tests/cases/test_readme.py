@@ -39,7 +39,6 @@ def test_the_example_without_correspondence_is_read(tmp_path):
             file = tmp_path / f"{name}_{region}.stl"
             own = surface.triangles[surface.region == number]
             meshio.Mesh(x, [("triangle", own)]).write(file)
-    (tmp_path / "pressure.csv").write_text("time,pressure\n0,0\n200,10\n400,16.5\n")
     case = read_case(save(tmp_path, EXAMPLES[1]))
     assert [frame.corresponds for frame in case.frames] == [True, False, False]
     assert [len(frame.annulus) for frame in case.frames] == [40, 40, 40]

@@ -64,9 +64,7 @@ def case(folder: Path) -> None:
     samples = np.random.default_rng(0).normal(0, 0.1, (4, 2, count, 3))
     errors = ErrorSamples(samples, samples[:, :, :2])
     write_error_samples(folder / "errors.npz", errors, ["open", "closed"])
-    (folder / "pressure.csv").write_text("time,pressure\n0.0,0.0\n0.2,60\n0.35,120\n0.4,121.5\n")
-    document |= {"pressure_curve": "pressure.csv", "description": "a valve, made up"}
-    del document["frames"][1]["pressure"]
+    document["description"] = "a valve, made up"
     document["observation"] = {
         "std_mm": 0.7, "correlation_length_mm": 10, "error_samples": "errors.npz"
     }  # fmt: skip
@@ -118,7 +116,7 @@ def by_slicerheart(path: Path) -> object:
 IMPORTERS: dict[str, tuple[Enter, Makers]] = {
     "case": (
         lambda path: read_case(path.parent),
-        beside(case, "case.yaml", "chordae.csv", "pressure.csv", "errors.npz", "open.vtp"),
+        beside(case, "case.yaml", "chordae.csv", "errors.npz", "open.vtp"),
     ),
     "surface": (surface, of(
         "VTP: text, plain, UInt64, LittleEndian, Int64",

@@ -7,16 +7,19 @@ import pytest
 
 from mvest.cases.case import Role
 from mvest.closure.frames import SCALE
-from mvest.personalisation import PressureErrors, design_case, expect_case
-from mvest.personalisation.design import ERRORS_MMHG, KINDS, errors_of
+from mvest.observation.learned import ErrorBeliefs
+from mvest.personalisation import PressureErrors, design_case, expect_case, personalise
+from mvest.personalisation.design import errors_of
 from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
-from mvest.personalisation.known import REACH
+from mvest.personalisation.known import EXACTLY, REACH
 from tests.made_up_closure import (
     FIELDS,
     PRESSURE,
+    PRIORS,
     error_source,
     made_up_case,
     settings,
+    shape,
     unknowns,
     use,
 )
@@ -55,18 +58,6 @@ def test_a_design_is_what_an_estimation_of_these_frames_expects(designs):
         assert left[name] == pytest.approx(log_std(unknown) / designs.knowledge[name], rel=1e-6)
 
 
-def test_frames_and_knowledge_only_help(designs):
-    for kind in KINDS:
-        table = [
-            [sum(designs.left(n, errors_of(kind, e, 100.0)).values()) for n in (1, 2, 5)]
-            for e in ERRORS_MMHG
-        ]
-        # One and two frames are among all five.
-        assert np.all(np.diff(table, axis=1) <= 1e-9)
-        assert np.all(np.diff(table, axis=0) >= -1e-9)
-    assert sum(designs.left(2, known=(SCALE,)).values()) < sum(designs.left(2).values())
-
-
 def test_frames_determine_an_offset_of_the_pressures_but_no_factor(monkeypatch):
     # Without its loose part the formula depends on pressure over stiffness only.
     rigid = {**FIELDS, "loose": np.zeros_like(FIELDS["loose"])}
@@ -103,9 +94,31 @@ def test_a_valve_that_does_not_close_has_no_designs(monkeypatch):
     assert "no equilibrium" in design_case(CASE, settings(pressures=STATED))
 
 
-def test_without_an_unknown_pressure_its_errors_do_not_count(monkeypatch):
+@pytest.mark.parametrize("errors", [None, ErrorBeliefs()])
+def test_intervals_are_those_of_an_estimate_of_the_generic_valve(monkeypatch, errors):
     use(monkeypatch)
-    moduli = tuple(u for u in unknowns() if u.name.startswith("E_f."))
-    found = design_case(CASE, settings(*moduli))
-    assert set(found.knowledge) == {u.name for u in moduli}
-    assert found.left(2, {"factor": 0.5, "offset": 9.0, "each": 9.0}) == found.left(2)
+    case = made_up_case(0.3, displaced=False)
+    generic = shape({name: mean for name, (mean, _) in PRIORS.items()})
+    frames = [replace(f, vertices=generic) if f.role is Role.CLOSED else f for f in case.frames]
+    case = replace(case, frames=tuple(frames))
+    expected = expect_case(case, settings(errors=errors))
+    fit = personalise(case, settings())
+    std = fit.result.filtered.transformed.std
+    for k, unknown in enumerate(expected.unknowns):
+        assert unknown["name"] == fit.result.parameters[k]
+        high, low, generic = unknown["high"], unknown["low"], unknown["generic"]
+        found = np.log(high / low) if generic > 0.0 else high - low
+        if errors is None:
+            assert found / (2 * REACH) == pytest.approx(std[k], rel=1e-4)
+        assert unknown["low_before"] < low < generic < high < unknown["high_before"]
+        assert 0.0 < unknown["width"] < 1.0
+    assert sum(row["share"] for row in expected.shares) == pytest.approx(2.0)
+    what = {row["what"].partition(", ")[2] for row in expected.narrower}
+    assert what > {EXACTLY, "mean of 4 beats"}
+
+
+def test_a_valve_that_does_not_close_has_a_reason(monkeypatch):
+    use(monkeypatch, fails_above=1.0)
+    expected = expect_case(made_up_case(0.3), settings())
+    assert expected.unknowns == ()
+    assert "no equilibrium" in expected.reason

@@ -8,7 +8,7 @@ import pytest
 from mvest.cases.case import Role, Uncertainty
 from mvest.observation.errors import SpatialCorrelation
 from mvest.personalisation import personalise
-from mvest.personalisation.diagnostics import _alike, diagnostics_of
+from mvest.personalisation.diagnostics import _neighbour_correlation, diagnostics_of
 from mvest.personalisation.estimation import CaseProblem
 from mvest.problem.verdict import NONE, TRUSTWORTHY, judge
 from tests.made_up_closure import PRIORS, made_up_case, settings, use
@@ -40,7 +40,7 @@ def test_a_case_with_errors_as_stated_is_trusted():
         assert not seen[key]
     ((_, innovation),) = seen["innovation"]
     assert innovation["low"] <= innovation["root"] <= innovation["high"]
-    assert size(seen, "alike") < 0.1
+    assert size(seen, "correlation") < 0.1
     assert [words["frame"] for _, words in seen["held_out"]] == ["late"]
     assert {words["what"] for _, words in seen["data_alone"]} == {"E_f.anterior", "E_f.posterior"}
     # Of a factor, estimated by its logarithm: a prior of 1.00 and 10 %.
@@ -72,8 +72,10 @@ def test_smooth_errors_that_are_stated_as_independent_show_as_a_pattern(std, pat
         replace(f, vertices=f.vertices + smooth) if f.role is Role.CLOSED else f
         for f in case.frames
     )
-    alike = size(diagnostics_of(personalise(replace(case, frames=frames), settings())), "alike")
-    assert alike > 0.4 if pattern else alike < 0.15
+    correlation = size(
+        diagnostics_of(personalise(replace(case, frames=frames), settings())), "correlation"
+    )
+    assert correlation > 0.4 if pattern else correlation < 0.15
 
 
 @pytest.mark.parametrize("smooth", [0, 1])
@@ -88,7 +90,8 @@ def test_the_pattern_is_that_of_the_last_surface(smooth):
     first = smooth * seen.sizes[0]
     points = seen.seen[smooth].points
     values[first : first + len(points)] = np.sin(points[:, 0] / 5.0)
-    assert (_alike(seen, values) > 0.3) == (smooth == 1)
+    assert (_neighbour_correlation(seen, values) > 0.3) == (smooth == 1)
+    assert _neighbour_correlation(seen, np.zeros_like(values)) == 0.0  # as for data without errors
 
 
 @pytest.mark.parametrize(("times", "doubtful"), [(3.0, True), (1.9, False)])

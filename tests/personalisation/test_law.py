@@ -12,13 +12,9 @@ from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
-from mvest.personalisation import personalise
-from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.sources import ClosedValve, law_and_mesh_sources, law_change
 from mvest.problem.registration import RegisteredModel
-from mvest.problem.verdict import judge
 from tests.closure.test_model import AT, GENTLE, SMALL, TISSUE, model_of
-from tests.made_up_closure import FIELDS, error_source, made_up_case, settings, use
 
 STIFFENING = {"anterior": ExponentialTissue(0.06, 4.325, 1446.5)}
 
@@ -82,26 +78,3 @@ def test_a_law_without_an_equilibrium_is_reported(gentle, monkeypatch):
     monkeypatch.setattr(ClosureModel, "_rest", lambda *given, **more: failed)
     reason = law_change(gentle, AT, [], STIFFENING, first)
     assert reason == f"anterior of an exponential law: {StepReason.NO_CONVERGENCE.value}"
-
-
-def test_an_uncertain_law_widens_the_intervals_except_those_of_moduli_alone(monkeypatch):
-    use(monkeypatch)
-    case = made_up_case(0.3, 8.0, np.random.default_rng(1))
-    column = 0.2 * FIELDS["E_f.anterior"].reshape(-1, 1)
-    target = "mvest.personalisation.errors.law_and_mesh_sources"
-    monkeypatch.setattr(target, lambda *_: (error_source(column),))
-    known = personalise(case, settings(moduli_only=True))
-    wider = personalise(case, settings(moduli_only=True, nuisance_law=STIFFENING))
-    anterior = wider.result.parameters.index("E_f.anterior")
-    assert wider.result.std[anterior] > 1.3 * known.result.std[anterior]
-    shares = {row["source"]: row["share"] for row in wider.details["shares"][::2]}
-    assert shares["law"] > 0.3
-    assert sum(shares.values()) == pytest.approx(1.0)
-    alone = [fit.alternatives["moduli_only"].std for fit in (wider, known)]
-    np.testing.assert_allclose(*alone, rtol=1e-6)
-    # Effects that cannot be computed make the estimate doubtful.
-    monkeypatch.setattr(target, lambda *_: "it did not close")
-    fit = personalise(case, settings(nuisance_law=STIFFENING))
-    assert fit.unaccounted == ("it did not close",)
-    failed = [g for g in judge(diagnostics_of(fit)).failed_checks if g.check == "errors left out"]
-    assert failed[0].text.endswith("is not in the intervals: it did not close")

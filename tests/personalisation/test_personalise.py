@@ -20,14 +20,12 @@ from mvest.personalisation import (
     personalise,
 )
 from mvest.personalisation.estimation import CaseProblem
-from mvest.personalisation.fitted_frames import _thinned
 from mvest.personalisation.known import IMAGES
 from mvest.personalisation.model import held_state
 from mvest.personalisation.sources import FrameSamples
 from mvest.problem.registration import REGISTRATION
 from tests.made_up_closure import (
     CLOSED_ANNULUS,
-    HELD_ANNULUS,
     MECHANICS,
     PRIORS,
     TRUE,
@@ -68,26 +66,9 @@ def test_a_twin_without_noise_gives_back_its_parameters():
         # The held-out frame fits too: its loads and its displacement are those of the case.
         assert distances["personalised"].max() < 1e-3
         assert 0.1 < distances["registered"].mean() < distances["generic"].mean()
-    closed, late = (f.distances["generic"].mean() for f in found.frames)
-    lines = str(found).splitlines()
-    assert lines[0] == f"case {found.case.name}"
-    assert lines[-2:] == [
-        f"closed: {closed:.2f} mm generic, 0.00 mm personalised",
-        f"late: {late:.2f} mm generic, 0.00 mm personalised (held out)",
-    ]
-
-
-def test_intervals_cover_noise():
-    # 12 cases: errors over standard deviations have a mean square of one, 0.38 to 1.95 is 99.9 %
-    # of chi-square with 24 degrees of freedom over 24.
-    rng = np.random.default_rng(7)
-    squares = []
-    for _ in range(12):
-        case = made_up_case(std_mm=0.3, noise=rng, displaced=False)
-        found = personalise(case, settings(*right_nuisances()))
-        error = np.log(found.result.estimate / true_of(found))
-        squares.append((error / found.result.filtered.transformed.std) ** 2)
-    assert 0.38 < np.mean(squares) < 1.95
+    late = found.frames[1].distances["generic"].mean()
+    expected = f"late: {late:.2f} mm generic, 0.00 mm personalised (held out)"
+    assert str(found).splitlines()[-1] == expected
 
 
 def test_moduli_alone_are_the_estimate_without_nuisances(formula):
@@ -140,8 +121,6 @@ def test_the_registered_valve_is_the_rigid_motion_of_least_squares():
     generic, registered = closed["generic"], closed["registered"]
     gaps = [np.linalg.norm(x[:, None] - x[None], axis=2) for x in (generic, registered)]
     np.testing.assert_allclose(gaps[0], gaps[1], atol=1e-9)
-    edges = [np.diff(x[[0, 1, 40, 90]], axis=0) for x in (generic, registered)]
-    assert np.linalg.det(edges[0]) == pytest.approx(np.linalg.det(edges[1]))
     # Least squares: no mean error and no mean moment is left.
     error, arm = seen - registered, registered - registered.mean(axis=0)
     np.testing.assert_allclose(error.mean(axis=0), 0, atol=1e-9)
@@ -151,20 +130,6 @@ def test_the_registered_valve_is_the_rigid_motion_of_least_squares():
     turn = np.linalg.lstsq(arms[0], arms[1], rcond=None)[0]
     expected = (late["generic"] - generic.mean(axis=0)) @ turn + registered.mean(axis=0)
     np.testing.assert_allclose(late["registered"], expected, atol=1e-8)
-
-
-def test_held_out_frames_have_the_loads_of_the_case(formula):
-    case = made_up_case(0.3)
-    later = replace(case.held_out[0], name="later", time=0.5)
-    personalise(replace(case, frames=(*case.frames, later)), settings())
-    states = formula[0].states
-    assert len(states) == 4
-    # First all of one valve, then all of the other: alternating would close both anew.
-    assert [at[0] for at in formula[0].held_at] == pytest.approx([6.23, 6.23, 5.1, 5.1], rel=0.1)
-    for state in states:
-        assert state.pressure_mmHg == 70.0
-        np.testing.assert_array_equal(state.annulus, HELD_ANNULUS)
-        np.testing.assert_array_equal(state.papillary_tips, case.frame(Role.CLOSED).papillary_tips)
 
 
 def test_a_frame_without_an_equilibrium_is_left_out(monkeypatch):
@@ -215,11 +180,6 @@ def test_points_between_leaflets_belong_to_either():
     np.testing.assert_array_equal(seen.free_edge_region, edge)
 
 
-def test_very_many_vertices_are_thinned_evenly():
-    assert _thinned(2000).all()
-    assert set(np.diff(np.flatnonzero(_thinned(2001)))) == {2}
-
-
 def test_a_valve_that_does_not_close_is_a_result_with_its_reason(monkeypatch):
     use(monkeypatch, fails_above=4.0)
     wanted = settings(moduli_only=True, paper=PaperSettings(), confirm=True)
@@ -263,36 +223,17 @@ def test_inadmissible_unknowns_are_refused(given, message):
         PersonaliseSettings(tuple(given), MECHANICS)
 
 
-@pytest.mark.parametrize(
-    ("name", "mean", "std"),
-    [
-        ("E_f.anterior", 0.0, 1.0),
-        ("shift.x", 0.0, 0.0),
-        ("shift.x", np.nan, 1.0),
-        ("shift.w", 1.0, 0.5),
-    ],
-)
-def test_inadmissible_priors_are_refused(name, mean, std):
-    with pytest.raises(InputError, match=name):
-        Prior(name, mean, std)
+def test_inadmissible_priors_are_refused():
+    for prior in (("E_f.anterior", 0.0, 1.0), ("shift.x", 0.0, 0.0), ("shift.w", 1.0, 0.5)):
+        with pytest.raises(InputError, match=prior[0]):
+            Prior(*prior)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (unknowns()[:1], "has the leaflets anterior, posterior"),
-        ((*unknowns()[:2], Prior("E_f.septal", 1.0, 0.5)), "has the leaflets anterior, posterior"),
-        ((*unknowns()[:2], Prior("chord_stiffness.tip9", 1.0, 0.5)), "tip9"),
-    ],
-)
-def test_unknowns_must_be_those_of_the_case(given, message):
-    with pytest.raises(InputError, match=message):
-        build_model(made_up_case(), settings(*given))
-
-
-def test_an_unknown_mesh_source_is_refused():
-    with pytest.raises(InputError, match="mesh source 'voxels'"):
-        CaseMesh(source="voxels")
+def test_unknowns_must_be_those_of_the_case():
+    with pytest.raises(InputError, match="has the leaflets anterior, posterior"):
+        build_model(made_up_case(), settings(*unknowns()[:1]))
+    with pytest.raises(InputError, match="tip9"):
+        build_model(made_up_case(), settings(*unknowns()[:2], Prior("chord_stiffness.tip9", 1, 1)))
 
 
 SMALL = CaseMesh(
@@ -395,9 +336,8 @@ def rougher(case, std, seed=9):
     return replace(case, frames=frames)
 
 
-@pytest.mark.parametrize("corresponds", [True, False])
-def test_errors_rougher_than_stated_are_learned(corresponds):
-    case = made_up_case(0.3, 8.0, np.random.default_rng(5), corresponds=corresponds)
+def test_errors_rougher_than_stated_are_learned():
+    case = made_up_case(0.3, 8.0, np.random.default_rng(5))
     found = personalise(rougher(case, 0.2), settings(errors=ErrorBeliefs()))
     learned = found.result.filtered
     low, high = learned.innovation.nis_band

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation import PaperSettings, personalise
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.problem.fields import case_fields
 from mvest.problem.record import EstimateRecord
 from mvest.problem.verdict import NONE, ONE_STATE
-from tests.made_up_closure import TISSUE, made_up_case, settings, unknowns, use
+from tests.made_up_closure import TISSUE, made_up_case, settings, use
 
 
 def personalised(*given, fails_above=np.inf, **changes):
@@ -63,16 +63,6 @@ def test_a_truth_is_added_to_all_moduli_and_alternatives(record):
         assert other.unknown("E_f.posterior").truth == 3.0
 
 
-def test_learned_errors_have_rows():
-    fit = personalised(*unknowns(fixed=True), errors=ErrorBeliefs())
-    rows = record_of_case(fit).details["errors"]
-    for row, quantity in zip(rows, fit.result.filtered.learned.quantities, strict=True):
-        assert row["believed"] == quantity.believed.median
-        assert (row["believed_low"], row["believed_high"]) == quantity.believed.interval()
-        assert row["learned"] == quantity.learned.median
-        assert (row["low"], row["high"]) == quantity.learned.interval()
-
-
 def test_every_frame_is_measured_as_observed_and_as_predicted(record):
     rows = record.details["measurements"]
     assert [(row["frame"], row["shape"]) for row in rows] == [
@@ -84,14 +74,6 @@ def test_every_frame_is_measured_as_observed_and_as_predicted(record):
     for row in rows:
         assert row["commissural_diameter_mm"] == pytest.approx(36, rel=0.05)
     assert rows[0]["orifice_mm2"] > 100
-
-
-def test_details_of_the_estimate_are_in_the_record(fit, record):
-    for name in ("known", "data_alone", "narrower", "shares"):
-        assert record.details[name] == fit.details[name]
-    assert record.details["narrower"][0]["what"] == "E_f anterior, pressure measured to ±3 mmHg"
-    sources = {row["source"] for row in record.details["shares"]}
-    assert {"pressure (factor)", "chordal stiffness (factor)"} < sources
 
 
 def test_gate_and_images_count_in_the_verdict(fit, record):
@@ -128,6 +110,14 @@ def test_arrays_are_those_that_a_report_reads(tmp_path, fit, corresponds):
     assert {"generic", "registered", "fitted"} <= arrays.keys()
     np.savez(tmp_path / "fields.npz", **arrays)
     fields = case_fields(tmp_path / "fields.npz")
+    # The tips lie below the annulus, however the valve lies.
+    for turn in Rotation.random(6, rng=1).as_matrix():
+        turned = {
+            name: values @ turn if values.dtype.kind == "f" and values.ndim > 1 else values
+            for name, values in arrays.items()
+            if not name.startswith("distance")
+        }
+        assert case_fields(turned).tips[..., 2].max() < 0.0
     assert fields.frames == ("closed", "late")
     assert fields.seen.tolist() == [True, False]
     if corresponds:

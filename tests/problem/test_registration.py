@@ -11,9 +11,7 @@ from mvest.problem.registration import (
     REGISTRATION,
     RegisteredModel,
     displace,
-    label_of,
     registration_of,
-    unit_of,
 )
 
 RNG = np.random.default_rng(2)
@@ -117,18 +115,3 @@ def test_parameters_may_come_in_any_order_and_in_part():
 def test_names_must_be_those_of_the_closure_and_of_the_displacement(names):
     with pytest.raises(InputError, match=r"expected E_f\.anterior, chord_rest_length"):
         RegisteredModel(Closure(), names)
-
-
-@pytest.mark.parametrize(
-    ("name", "label", "unit"),
-    [
-        ("E_f.anterior", "E_f anterior", "MPa"),
-        ("pressure_scale", "pressure (factor)", ""),
-        ("pressure_error.late", "pressure in frame late", "mmHg"),
-        ("shift.x", "shift along x", "mm"),
-        ("turn.z", "turn about z", "degrees"),
-        ("m[0]", "m[0]", ""),
-    ],
-)
-def test_labels_and_units_of_parameters(name, label, unit):
-    assert (label_of(name), unit_of(name)) == (label, unit)

@@ -63,14 +63,8 @@ def draw(rng, deviations=None, spread=0.0, **simulation):
 def test_what_is_hidden_spreads_as_requested():
     rng = np.random.default_rng(0)
     drawn = [draw(rng, Deviations(0.1, 0.03, 0.25, 1.5, 4.0), 0.5) for _ in range(4000)]
-    factors = {
-        "E_f.anterior": 0.5,
-        "pressure_scale": 0.1,
-        "chord_rest_length": 0.03,
-        "chord_stiffness": 0.25,
-    }
+    factors = {"E_f.anterior": 0.5, "pressure_scale": 0.1, "chord_rest_length": 0.03}
     displacements = {name: 1.5 if name.startswith("shift") else 4.0 for name in REGISTRATION}
-    columns = []
     for name, std in (factors | displacements).items():
         found = np.array([values[name] for values in drawn])
         # Factors are log-normal with the median one, so none is negative.
@@ -78,9 +72,6 @@ def test_what_is_hidden_spreads_as_requested():
         # Four standard errors: std / sqrt(n) of a mean, std / sqrt(2 n) of a spread.
         assert abs(found.mean()) < 4 * std / np.sqrt(4000)
         assert found.std() == pytest.approx(std, rel=4 / np.sqrt(8000))
-        columns.append(found)
-    # Nothing is drawn with anything else: correlations of 4000 pairs are below 4 / sqrt(4000).
-    assert np.abs(np.corrcoef(columns) - np.eye(10)).max() < 0.065
 
 
 def test_a_patient_is_seen_where_it_is_up_to_its_displacement_and_noise(patient, values):
@@ -108,7 +99,7 @@ def test_a_patient_is_seen_where_it_is_up_to_its_displacement_and_noise(patient,
         np.testing.assert_array_equal(frame.free_edge, frame.vertices[case.free_edge])
         assert frame.corresponds
     assert held.time > closed.time > 0
-    # Stated are the boundary without the displacement, and neither pressure nor chordae as true.
+    # The case states the boundary without the displacement, and its own pressure and chordae.
     seen = TEMPLATE.valve(32, 9)
     motion = seen.motion
     np.testing.assert_array_equal(closed.annulus, motion.annulus[-1])
@@ -117,8 +108,6 @@ def test_a_patient_is_seen_where_it_is_up_to_its_displacement_and_noise(patient,
     np.testing.assert_allclose(held.papillary_tips, closed.papillary_tips + np.array([0, 0, 0.2]))
     assert [frame.pressure_mmHg for frame in case.frames] == [0.0, 100.0, 95.0]
     np.testing.assert_array_equal(case.chordae.rest_length, seen.chordae.rest_length)
-    np.testing.assert_array_equal(case.chordae.axial_stiffness, seen.chordae.axial_stiffness)
-    assert (case.uncertainty.std_mm, case.uncertainty.correlation_length_mm) == (0.4, 8.0)
 
 
 def turn_of(registration):
@@ -151,25 +140,6 @@ def seen_again(patient, rng, **simulation):
     settings = replace(SMALL, **simulation)
     seen = TEMPLATE.valve(32, 9)
     return virtual_patient._case("small", "d", seen, true, settings, MECHANICS, rng)
-
-
-def test_errors_have_the_size_and_the_reach_that_the_case_states(patient):
-    rng, errors = np.random.default_rng(4), []
-    for _ in range(60):
-        case = seen_again(patient, rng)
-        errors.append([f.vertices - patient.positions[f.name] for f in case.frames[1:]])
-    errors = np.array(errors)
-    assert errors.std() == pytest.approx(0.4, rel=0.05)
-    # Frames and coordinates are independent of each other.
-    flat = errors.transpose(0, 2, 1, 3).reshape(-1, 6)
-    assert np.abs(np.corrcoef(flat.T) - np.eye(6)).max() < 0.15
-    # Neighbours are correlated, vertices of other sides are not.
-    pair = errors[:, :, [0, 1, 16], :].reshape(60, 2, 3, 3)
-    alike = [np.mean(pair[:, :, 0] * pair[:, :, k]) / 0.16 for k in (1, 2)]
-    points = case.surface.vertices
-    assert np.linalg.norm(points[0] - points[1]) < 8.0 < np.linalg.norm(points[0] - points[16]) / 3
-    assert alike[0] > 0.5
-    assert abs(alike[1]) < 0.2
 
 
 def test_rough_errors_come_on_top_and_are_not_stated(patient):

@@ -32,12 +32,8 @@ from mvest.processes import side_by_side
 from mvest.quantities import Count, Length, Processes, Seed, Share, within
 from mvest.reading.documents import parse_json
 from mvest.reading.npz import read_npz
-from mvest.simulation.population import (
-    PopulationSettings,
-    draw_population,
-    load_population,
-    save_population,
-)
+from mvest.simulation.motion import MotionSettings
+from mvest.simulation.population import draw_population, load_population, save_population
 from mvest.simulation.trials import Trial
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
@@ -75,7 +71,7 @@ class ImagingSettings:
     """Detectors for valves in volumes: their training and their test."""
 
     bases: dict[str, TemplateParameters] = field(default_factory=dict)
-    population: PopulationSettings = field(default_factory=PopulationSettings)
+    motion: MotionSettings = field(default_factory=MotionSettings)
     train: DrawnValves
     calibration: DrawnValves  # for the stated errors of the detectors
     test: DrawnValves
@@ -109,7 +105,7 @@ class ImagingStore:
         described = {
             "drawn": asdict(getattr(self.settings, which)),
             "bases": [[name, asdict(values)] for name, values in self.settings.bases.items()],
-            "settings": asdict(self.settings.population),
+            "settings": asdict(self.settings.motion),
             "mechanics": asdict(self._mechanics),
         }
         made_by = (draw_population, save_population)
@@ -120,7 +116,7 @@ class ImagingStore:
         drawn, own = getattr(self.settings, which), self.settings
 
         def draw() -> tuple[MovingValve, ...]:
-            what = drawn.count, drawn.seed, own.bases, own.population, self._mechanics
+            what = drawn.count, drawn.seed, own.bases, own.motion, self._mechanics
             made = draw_population(*what, processes=own.processes)
             return tuple(_followed(f"valves: {which}", drawn.count, "valve", made))
 

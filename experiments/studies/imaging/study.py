@@ -137,7 +137,7 @@ def _held_out(store: ImagingStore, file: Path) -> list[Seen]:
     numbers = dict(zip(SEQUENCES, (settings.calibration.count, *tested), strict=True))
     numbers |= dict(zip(VOLUMES, (counts.volumes, counts.shifted), strict=True))
     numbers |= dict.fromkeys(WITHOUT_VALVE, counts.without_valve)
-    acquisition, closed = settings.training.acquisition, settings.population.motion.frames - 1
+    acquisition, closed = settings.training.acquisition, settings.motion.frames - 1
     seen = []
     for kinds, function in (((*VOLUMES, *WITHOUT_VALVE), try_volume), (SEQUENCES, try_sequence)):
         trials = [
@@ -359,7 +359,7 @@ def require_imaging(config: Values) -> None:
         raise ConfigurationError(
             "imaging.model is given and imaging.evaluate=false: nothing would be done"
         )
-    motion = settings.population.motion
+    motion = settings.motion
     landmark_vertices(ValveLayout(motion.columns, motion.rows))
 
 

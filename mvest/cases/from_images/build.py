@@ -120,8 +120,6 @@ def case_of_sequence(
 
     Parameters
     ----------
-    sequence : ValveSequence
-    frames : CaseFrames
     texts : mapping
         The case's name, description, source, licence and whether it is simulated.
     thickness_mm : mapping, optional

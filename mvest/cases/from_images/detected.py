@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from mvest.cases.case import ValveCase
-from mvest.cases.folder import pressure_curve, write_case
+from mvest.cases.folder import write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
     samples_in_world,
@@ -41,6 +42,7 @@ from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.quantities import BeatTime, Count, Pressure, Share, Thickness
 from mvest.reading.text import read_numbers
+from mvest.typing import FloatArray
 
 LEAFLETS = ("anterior", "posterior")
 """Order of ``ImagedSettings.thickness_mm``."""
@@ -71,12 +73,8 @@ class ImagedSettings:
     pressure_curve: str | None = None  #: .csv of time,pressure (s, mmHg) instead
     thickness_mm: tuple[Thickness, ...] = ()  #: of the LEAFLETS; empty: generic
     min_confidence: Share = MIN_CONFIDENCE  #: of the best frame, and of the frames that are chosen
-    error_samples: Count = (
-        200  # largest number taken from held-out volumes; mirrored ones are added
-    )
-    name: str | None = (
-        None  # None: made of the file's content, since files are named after patients
-    )
+    error_samples: Count = 200  #: at most, from held-out volumes; mirror images are added
+    name: str | None = None  #: None: made of the file's content, as files are named after patients
     description: str = ""
     source: str = ""
     licence: str = ""
@@ -187,6 +185,27 @@ def read_for_case(file: Path, settings: ImagedSettings) -> VolumeSequence:
     return volume
 
 
+def pressure_curve(time: FloatArray, pressure_mmhg: FloatArray) -> Callable[[float], float]:
+    """Transmitral pressure (mmHg) over time (s): a monotone cubic through points ``(k,)``.
+
+    InputError unless there are two or more times that increase. The curve itself raises InputError
+    at a time outside it.
+    """
+    if len(time) < 2 or (np.diff(time) <= 0).any():
+        raise InputError(f"pressure curve: times {time} s, expected two or more that increase")
+    interpolated = PchipInterpolator(time, pressure_mmhg)
+
+    def curve(at: float) -> float:
+        if not time[0] <= at <= time[-1]:
+            raise InputError(
+                f"time {at:g} s lies outside the pressure curve, which runs from {time[0]:g} to "
+                f"{time[-1]:g} s; give the pressure of the frame, or a curve that covers its time"
+            )
+        return float(interpolated(at))
+
+    return curve
+
+
 def detect_in_volume(
     file: Path | str,
     settings: ImagedSettings | None = None,
@@ -198,8 +217,6 @@ def detect_in_volume(
 
     Parameters
     ----------
-    file : Path
-    settings : ImagedSettings, optional
     estimate : bool
         Whether the case will be estimated, so that a pressure is required.
     progress : callable, optional
@@ -216,8 +233,8 @@ def detect_in_volume(
     # Settings are checked before anything that takes long.
     pressure: Any = settings.pressure_mmHg
     if settings.pressure_curve is not None:
-        table = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
-        pressure = pressure_curve(*table.T)
+        points = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
+        pressure = pressure_curve(*points.T)
     elif estimate and pressure is None:
         raise InputError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "

@@ -164,8 +164,6 @@ def coverage(
 
     Parameters
     ----------
-    layout : ValveLayout
-    accuracy : DetectionAccuracy
     errors : (S, 2, n, 3) mm
         Detected minus true, in the open and the closed frame.
     shapes : (S, 2, n + 2, 3) mm
@@ -224,7 +222,6 @@ def error_at_shape(
 
     Parameters
     ----------
-    layout : ValveLayout
     errors, shapes : (S, F, n + 2, 3) mm
         Errors of leaflets, then tips, of S >= 2 other valves in F frames, and their detected
         shapes, each in its own axes. Equal shapes give the mean error.

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
+from mvest.cases.from_images.detected import pressure_curve
 from mvest.cases.from_images.detector_errors import samples_in_world, valve_axes
 from mvest.cases.from_images.measures import measure_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
@@ -70,16 +71,6 @@ def test_the_case_is_that_of_the_frames_and_passes_the_checks_of_a_folder(tmp_pa
     np.testing.assert_array_equal(case.surface.vertices, sequence().vertices[3])
 
 
-def test_a_case_does_not_depend_on_how_the_patient_lies():
-    origin = np.array([30.0, -80.0, 12.0])
-    here = case_of_sequence(sequence(), FRAMES, TEXTS)
-    there = case_of_sequence(sequence(TURN, origin), FRAMES, TEXTS)
-    np.testing.assert_allclose(there.surface.fibre, here.surface.fibre @ TURN.T, atol=1e-9)
-    np.testing.assert_allclose(there.chordae.rest_length, here.chordae.rest_length, rtol=1e-9)
-    np.testing.assert_array_equal(there.chordae.tip, here.chordae.tip)
-    assert there.derived == here.derived
-
-
 def test_thickness_and_fibres_vary_as_in_the_template():
     case, valve = case_of_sequence(sequence(TURN), FRAMES, TEXTS), Template().valve(32, 9)
     np.testing.assert_allclose(case.surface.thickness, valve.surface.thickness, rtol=1e-12)
@@ -106,8 +97,8 @@ def test_frames_are_chosen_by_orifice_and_contact_among_those_that_are_sure():
     # Frames that no one believes in are not chosen, whatever they show.
     unsure = replace(seen, frame_confidence=np.array([0.3, 0.8, 0.85, 0.9]))
     assert choose_frames(unsure, rows, 120.0).open == 1
-    told = choose_frames(seen, rows, 120.0, open_=1, closed=3)
-    assert (told.open, told.closed, told.derived) == (1, 3, ())
+    given = choose_frames(seen, rows, 120.0, open_=1, closed=3)
+    assert (given.open, given.closed, given.derived) == (1, 3, ())
     with pytest.raises(InputError, match=r"0 of 4 frames .*imaged\.open_frame"):
         choose_frames(replace(seen, frame_confidence=np.full(4, 0.2)), rows, 120.0)
     with pytest.raises(InputError, match="closed frame 4, expected one of 0 to 3"):
@@ -170,3 +161,14 @@ def test_frames_pressures_and_thicknesses_out_of_place_are_refused():
         CaseFrames(0, 2, 16.0)
     with pytest.raises(InputError, match="thickness of anterior, expected of anterior, posterior"):
         case_of_sequence(sequence(), FRAMES, TEXTS, thickness_mm={"anterior": 1.3})
+
+
+def test_the_pressure_curve_is_monotone_and_not_extrapolated():
+    time, pressure = np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.0, 5.0, 120.0, 121.0])
+    curve = pressure_curve(time, pressure)
+    np.testing.assert_allclose([curve(t) for t in time], pressure)
+    assert np.all(np.diff([curve(t) for t in np.linspace(0.0, 0.3, 50)]) > 0.0)
+    with pytest.raises(InputError, match=r"time 0.4 s lies outside .* from 0 to 0.3 s"):
+        curve(0.4)
+    with pytest.raises(InputError, match="expected two or more that increase"):
+        pressure_curve(time[::-1], pressure)

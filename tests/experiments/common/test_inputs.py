@@ -68,8 +68,9 @@ def placed(name: str, folder: Path) -> tuple[object, Path]:
     file = folder / "a.npz"
     file.write_text("1")
     if name == "case":
-        frame = "{name: a, time: 0, role: reference, surface: a.npz, papillary_tips: [[0, 0, 0]]}"
-        text = f"version: 1\nname: a\nunits: {{length: mm}}\nregions: [a]\nframes: [{frame}]\n"
+        frame = "{name: a, time: 0, role: reference, surface: a.npz, papillary_tips: [[0, 0, 0]]"
+        text = "version: 1\nname: a\nunits: {length: mm}\nregions: [a]\n"
+        text += f"frames: [{frame}, pressure: 0}}]\n"
         (folder / "case.yaml").write_text(text)
         return str(folder), file
     if name == "donor.recording":

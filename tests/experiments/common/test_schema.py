@@ -8,7 +8,7 @@ from experiments.common.config import Mechanics
 from experiments.common.schema import build, schema
 from mvest.imaging.learning.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
-from mvest.simulation.population import PopulationSettings
+from mvest.simulation.motion import MotionSettings
 from mvest.valve.anatomy.dimensions import TemplateParameters
 
 
@@ -41,7 +41,7 @@ def test_the_librarys_defaults_are_the_configurations() -> None:
     template = OmegaConf.to_container(OmegaConf.structured(schema(ValveSettings)))
     assert build(TemplateParameters, template) == TemplateParameters()
     # Dataclasses within dataclasses, and mappings.
-    for cls in (PopulationSettings, TrainingSettings):
+    for cls in (MotionSettings, TrainingSettings):
         made = OmegaConf.to_container(OmegaConf.structured(schema(cls)))
         assert build(cls, made) == cls()
     mechanics = OmegaConf.structured(schema(Mechanics))

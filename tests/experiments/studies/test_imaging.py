@@ -141,7 +141,7 @@ def test_given_detectors_are_tested_and_none_is_trained(done: Path, capsys):
         ("imaging.test.seed=1", "expected different seeds"),
         ("imaging.train.count=0", "imaging.train.count = 0, expected 1 to"),
         ("imaging.training.modes=7", "imaging.training.modes = 7, expected 8 to"),
-        ("imaging.population.motion.columns=12", "no column"),
+        ("imaging.motion.columns=12", "no column"),
     ],
 )
 def test_wrong_settings_are_refused_in_one_line(tmp_path: Path, override: str, words: str, capsys):

@@ -70,16 +70,9 @@ def test_a_valve_is_turned_the_same_way_however_it_lies(case, fields) -> None:
     assert SIDE.axes[2, 1] > 0.9
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("fitted", np.zeros((2, 5, 3)), "fitted has the shape"),
-        ("annulus", np.array([0, 9999]), "annulus has indices outside"),
-    ],
-)
-def test_arrays_that_do_not_fit_are_named(case, name, value, message) -> None:
-    with np.load(case[1]) as stored, pytest.raises(InputError, match=message):
-        case_fields(dict(stored) | {name: value})
+def test_a_file_without_the_shapes_of_a_case_is_refused() -> None:
+    with pytest.raises(InputError, match="arrays: no fields of a case"):
+        case_fields({"frames": ["closed"]})
 
 
 def test_both_panels_of_figure_3_have_one_scale(fields) -> None:
