@@ -32,20 +32,11 @@ DAMAGE = (OSError, ValueError, LookupError, TypeError)
 
 @dataclass(frozen=True, slots=True)
 class Entry(Generic[T]):
-    """A cached file or folder, which is either complete or absent.
+    """A cached file or folder, which is either complete or absent."""
 
-    Attributes
-    ----------
-    path : Path
-        Named after everything that decides its content.
-    read : callable
-        Reads a path; raises one of `DAMAGE` for a damaged entry.
-    remake : bool
-        Whether a damaged entry is made again. One that cannot be reproduced raises instead.
-    """
-
-    path: Path
-    read: Callable[[Path], T]
+    path: Path  #: named after everything that decides its content
+    read: Callable[[Path], T]  #: reads a path; raises one of `DAMAGE` for a damaged entry
+    #: whether a damaged entry is made again. One that cannot be reproduced raises instead.
     remake: bool = True
 
     def found(self) -> T | None:

@@ -25,23 +25,12 @@ SPACING = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosedState:
-    """A closed valve from which further closures may be continued.
+    """A closed valve from which further closures may be continued."""
 
-    Attributes
-    ----------
-    at : (p,)
-        Its parameters.
-    positions : (n, 3) mm
-        Of the mesh's nodes.
-    guide : ClosedState or None
-        Closed state of the model's guide.
-    slopes : (p, n, 3) mm or None
-        Derivatives of the positions with respect to the parameters, if known.
-    """
-
-    at: FloatArray
-    positions: FloatArray
-    guide: ClosedState | None = None
+    at: FloatArray  #: (p,), its parameters
+    positions: FloatArray  #: (n, 3) mm, of the mesh's nodes
+    guide: ClosedState | None = None  #: closed state of the model's guide
+    #: (p, n, 3) mm or None, derivatives of the positions with respect to the parameters, if known
     slopes: FloatArray | None = None
 
 
@@ -50,16 +39,10 @@ class Coordinates:
     """Logarithms of positive parameters; coefficients of a field times its deviation of log E_f.
 
     A stiffening alpha counts as a share of log(1 + alpha), which is finite without stiffening.
-
-    Attributes
-    ----------
-    units : (p,)
-        Change of log E_f per coefficient of a field; factor on a logarithm.
-    offsets : (p,)
-        Added to a parameter before its logarithm is taken; NaN for coefficients of a field.
     """
 
-    units: FloatArray
+    units: FloatArray  #: (p,), change of log E_f per coefficient of a field; factor on a logarithm
+    #: (p,), added to a parameter before its logarithm is taken; NaN for coefficients of a field
     offsets: FloatArray
 
     @classmethod

@@ -135,15 +135,9 @@ class CycleProtocol:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleModel:
-    """Predicted positions of the observed vertices in every frame of a cycle.
+    """Predicted positions of the observed vertices in every frame of a cycle."""
 
-    Attributes
-    ----------
-    closure : ClosureModel
-        Valve, mesh, mechanics and names of the parameters; its own protocol is not used.
-    protocol : CycleProtocol
-    """
-
+    #: valve, mesh, mechanics and names of the parameters; its own protocol is not used
     closure: ClosureModel
     protocol: CycleProtocol
 

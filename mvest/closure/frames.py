@@ -37,30 +37,19 @@ def is_frame_pressure(name: str) -> bool:
 class FramesModel:
     """The open valve, and several closed frames of it.
 
-    Attributes
-    ----------
-    model : ClosureModel
-        Closes the valve to the closed frame, under the pressure of its protocol.
-    closed_name : str
-        Name of that frame.
-    states : mapping of str to HeldState
-        Frame -> its loads, on the contact valve's annulus, in the order in which they are reached.
-    pressure_mmHg : float
-        Stated pressure of the closed frame, as in the model's protocol.
-    errors : tuple of str
-        Parameters that are errors of stated pressures; with any of them, `SCALE` must be a
-        parameter of the model.
-
     Raises
     ------
     InputError
         If an error belongs to no frame, or `SCALE` is missing.
     """
 
-    model: ClosureModel
-    closed_name: str
+    model: ClosureModel  #: closes the valve to the closed frame, under the pressure of its protocol
+    closed_name: str  #: name of that frame
+    #: frame -> its loads, on the contact valve's annulus, in the order in which they are reached
     states: Mapping[str, HeldState]
-    pressure_mmHg: float
+    pressure_mmHg: float  #: stated pressure of the closed frame, as in the model's protocol
+    #: parameters that are errors of stated pressures; with any of them, `SCALE` must be a parameter
+    #: of the model
     errors: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -64,65 +64,44 @@ class ClosureResult:
 
 @dataclass(eq=False)
 class ClosureModel:
-    """Predicted positions of the observed vertices as a function of the parameters.
+    """Predicted positions of the observed vertices as a function of the parameters."""
 
-    Attributes
-    ----------
-    valve : Valve
-        Its surface vertices are observed.
-    contact_valve : Valve
-        The same valve where contact is sampled.
-    mesh : SolidMesh
-    settings : MechanicsSettings
-    names : tuple of str
-        Names of the parameters (see :class:`mvest.mechanics.parameters.Parameter`).
-    fixed : dict
-        Values of the parameters that are not estimated.
-    continuation : bool
-        Whether a closure starts from the last closed state, or from where its derivatives predict
-        the next one, and goes straight to the new equilibrium. Otherwise each starts from the open
-        valve. Both give the same closed state if it is unique, which the gate
-        (:mod:`mvest.closure.robustness`) tests.
-    reach : float
-        Largest change of a coordinate (:class:`mvest.closure.continuation.Coordinates`) over which
-        a closure is continued. Beyond it the valve is closed from the open state: a much softer
-        valve may fold differently.
-    guide : ClosureModel, optional
-        The same valve and parameters on a coarser mesh. A closure that would start from the open
-        valve is computed there first, and the search for equilibrium on this mesh starts from its
-        closed state. A guide may have a guide.
-    repeat : bool
-        Whether a continued closure that fails is repeated with the guide, and then from the open
-        valve, which takes long and seldom succeeds.
-    largest_change : float
-        Largest change of a coordinate between continued equilibria. A more distant state is
-        reached through others: Newton's method does not find equilibria millimetres away.
-    rounded_start : bool
-        Whether a continued valve without a near closed state is closed first at rounded parameters
-        (:meth:`mvest.closure.continuation.Coordinates.rounded`). All estimates of a valve with
-        similar starting values then begin from the same closed state.
-    on_step : callable, optional
-        Progress: called with (time, Newton iterations).
-    ties : TiedPoints, optional
-        Pairs of points that are held together while the valve closes, as by a clip.
-    perturbation : (n, 3) mm, optional
-        Initial displacement of the nodes of the open valve.
-    """
-
-    valve: Valve
-    contact_valve: Valve
+    valve: Valve  #: its surface vertices are observed
+    contact_valve: Valve  #: the same valve where contact is sampled
     mesh: SolidMesh
     settings: MechanicsSettings
+    #: names of the parameters (see :class:`mvest.mechanics.parameters.Parameter`)
     names: tuple[str, ...]
+    #: values of the parameters that are not estimated
     fixed: dict[str, float] = field(default_factory=dict)
+    #: whether a closure starts from the last closed state, or from where its derivatives predict
+    #: the next one, and goes straight to the new equilibrium. Otherwise each starts from the open
+    #: valve. Both give the same closed state if it is unique, which the gate
+    #: (:mod:`mvest.closure.robustness`) tests.
     continuation: bool = False
+    #: largest change of a coordinate (:class:`mvest.closure.continuation.Coordinates`) over which a
+    #: closure is continued. Beyond it the valve is closed from the open state: a much softer valve
+    #: may fold differently.
     reach: float = np.inf
+    #: the same valve and parameters on a coarser mesh. A closure that would start from the open
+    #: valve is computed there first, and the search for equilibrium on this mesh starts from its
+    #: closed state. A guide may have a guide.
     guide: ClosureModel | None = None
+    #: whether a continued closure that fails is repeated with the guide, and then from the open
+    #: valve, which takes long and seldom succeeds
     repeat: bool = True
+    #: largest change of a coordinate between continued equilibria. A more distant state is reached
+    #: through others: Newton's method does not find equilibria millimetres away.
     largest_change: float = np.inf
+    #: whether a continued valve without a near closed state is closed first at rounded parameters
+    #: (:meth:`mvest.closure.continuation.Coordinates.rounded`). All estimates of a valve with
+    #: similar starting values then begin from the same closed state.
     rounded_start: bool = False
+    #: progress: called with (time, Newton iterations)
     on_step: Callable[[float, int], None] | None = None
+    #: pairs of points that are held together while the valve closes, as by a clip
     ties: TiedPoints | None = None
+    #: (n, 3) mm, optional, initial displacement of the nodes of the open valve
     perturbation: FloatArray | None = None
 
     _closed: ClosedState | None = field(default=None, init=False, repr=False)

@@ -37,41 +37,20 @@ SINGLE = (0.8, 1.2)
 
 @dataclass(frozen=True, slots=True)
 class GateCase:
-    """One variation of the closure that must not change the closed state.
-
-    Attributes
-    ----------
-    name : str
-    dt : float
-        Factor on the time step.
-    ramp : float
-        Factor on the time over which pressure and boundary motion rise.
-    converged_path : bool
-        Whether every step is solved as exactly as the last.
-    mesh : float
-        Factor on the number of cells along both directions of the leaflets.
-    activation : float
-        Factor on the activation distance of contact.
-    sampling : float
-        Factor on the density of the contact samples along both directions.
-    guided : bool
-        Whether the model's guide is used.
-    perturbed : int
-        Seed of a smooth displacement of the open leaflets before they close; 0 for none.
-    start : float
-        Factor on all moduli E_f at which the valve is closed first, and continued from; 1: closed
-        from the open valve.
-    """
+    """One variation of the closure that must not change the closed state."""
 
     name: str
-    dt: float = 1.0
-    ramp: float = 1.0
-    converged_path: bool = False
-    mesh: float = 1.0
-    activation: float = 1.0
-    sampling: float = 1.0
-    guided: bool = False
+    dt: float = 1.0  #: factor on the time step
+    ramp: float = 1.0  #: factor on the time over which pressure and boundary motion rise
+    converged_path: bool = False  #: whether every step is solved as exactly as the last
+    mesh: float = 1.0  #: factor on the number of cells along both directions of the leaflets
+    activation: float = 1.0  #: factor on the activation distance of contact
+    sampling: float = 1.0  #: factor on the density of the contact samples along both directions
+    guided: bool = False  #: whether the model's guide is used
+    #: seed of a smooth displacement of the open leaflets before they close; 0 for none
     perturbed: int = 0
+    #: factor on all moduli E_f at which the valve is closed first, and continued from; 1: closed
+    #: from the open valve
     start: float = 1.0
 
     @property

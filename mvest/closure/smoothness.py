@@ -53,17 +53,10 @@ ROUND_OFF = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathState:
-    """A closed state and its derivative along a path.
+    """A closed state and its derivative along a path."""
 
-    Attributes
-    ----------
-    y : (n, 3) mm
-    slope : (n, 3) mm
-        Per unit of the logarithm of the factor.
-    """
-
-    y: FloatArray
-    slope: FloatArray
+    y: FloatArray  #: (n, 3) mm
+    slope: FloatArray  #: (n, 3) mm, per unit of the logarithm of the factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,24 +124,12 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Closed states along changing moduli.
+    """Closed states along changing moduli."""
 
-    Attributes
-    ----------
-    name : str
-        What is changed.
-    pieces : tuple of Piece
-        In ascending order, after halving; up to the first that fails.
-    closures : int
-        How many states were computed, without the central one.
-    reason : str
-        Why it fails; empty if it passes.
-    """
-
-    name: str
-    pieces: tuple[Piece, ...]
-    closures: int
-    reason: str
+    name: str  #: what is changed
+    pieces: tuple[Piece, ...]  #: in ascending order, after halving; up to the first that fails
+    closures: int  #: how many states were computed, without the central one
+    reason: str  #: why it fails; empty if it passes
 
     @property
     def share(self) -> float:

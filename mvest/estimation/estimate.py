@@ -74,63 +74,40 @@ class Estimate:
     """Estimate of p parameters after k iterates, from the start to the estimate.
 
     Filter coordinates are z = T(m) of the transform. Covariances are transformed to first order.
-
-    Attributes
-    ----------
-    names : tuple of str, (p,)
-    prior : Gaussian
-        Prior of the parameters themselves.
-    transform : Transform
-    transformed_iterates : (k, p), filter coordinates
-    transformed_iterate_covariances : (k, p, p), filter coordinates
-        Paper's filter: covariance after round k, with the prior's in row 0. Iterated filter:
-        covariance of the posterior linearised at iterate k. Others: see each filter.
-    objective : (k,)
-        Paper's filter: ½ (y − h)ᵀ R⁻¹ (y − h). Others: the same plus the prior's term; for filters
-        that run the model around an iterate, h is the mean of these predictions. NaN in the last
-        row if the model failed there.
-    log_likelihood : (k,)
-        log N(e; 0, S) of the innovation at each iterate; NaN as in `objective`, and if a filter
-        does not compute it.
-    prediction : Prediction or None
-        At the estimate; None if the model failed there. If the model has no derivatives, its
-        Jacobian is the slope between the filter's points.
-    innovation : InnovationSummary or None
-        At the last iterate; None if the model failed there.
-    standardised : (n,) or None
-        S^(-1/2) e of that innovation; white if the model and its covariances are right.
-    reason : Reason
-    detail : str
-        Numbers that belong to the reason, or the failed model's reason.
-    forward_solves : int
-        Runs of the model, failed ones included.
-    transformed_samples : (s, p), filter coordinates, or None
-        Draws from the posterior, if the filter makes them; intervals are then their quantiles.
-    learned : LearnedNoise or None
-        The noise, if it was learned.
-    check : ApproximationCheck or None
-        The worst check of the posterior; None if nothing was compared.
-    curvature : (p, p), filter coordinates, or None
-        Second derivatives of the objective that its linearisation leaves out,
-        ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂z²``, if the filter computed them.
     """
 
-    names: tuple[str, ...]
-    prior: Gaussian
+    names: tuple[str, ...]  #: tuple of str, (p,)
+    prior: Gaussian  #: prior of the parameters themselves
     transform: Transform
-    transformed_iterates: FloatArray
+    transformed_iterates: FloatArray  #: (k, p), filter coordinates
+    #: (k, p, p), filter coordinates, paper's filter: covariance after round k, with the prior's in
+    #: row 0. Iterated filter: covariance of the posterior linearised at iterate k. Others: see each
+    #: filter.
     transformed_iterate_covariances: FloatArray
+    #: (k,), paper's filter: ½ (y − h)ᵀ R⁻¹ (y − h). Others: the same plus the prior's term; for
+    #: filters that run the model around an iterate, h is the mean of these predictions. NaN in the
+    #: last row if the model failed there.
     objective: FloatArray
+    #: (k,), log N(e; 0, S) of the innovation at each iterate; NaN as in `objective`, and if a
+    #: filter does not compute it
     log_likelihood: FloatArray
+    #: at the estimate; None if the model failed there. If the model has no derivatives, its
+    #: Jacobian is the slope between the filter's points.
     prediction: Prediction | None
-    innovation: InnovationSummary | None
+    innovation: InnovationSummary | None  #: at the last iterate; None if the model failed there
     reason: Reason
-    detail: str
-    forward_solves: int
+    detail: str  #: numbers that belong to the reason, or the failed model's reason
+    forward_solves: int  #: runs of the model, failed ones included
+    #: (n,) or None, S^(-1/2) e of that innovation; white if the model and its covariances are right
     standardised: FloatArray | None = None
+    #: (s, p), filter coordinates, or None, draws from the posterior, if the filter makes them;
+    #: intervals are then their quantiles
     transformed_samples: FloatArray | None = None
-    learned: LearnedNoise | None = None
+    learned: LearnedNoise | None = None  #: the noise, if it was learned
+    #: the worst check of the posterior; None if nothing was compared
     check: ApproximationCheck | None = None
+    #: (p, p), filter coordinates, or None, second derivatives of the objective that its
+    #: linearisation leaves out, ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂z²``, if the filter computed them
     curvature: FloatArray | None = None
 
     def __str__(self) -> str:

@@ -70,25 +70,15 @@ class LearnedQuantity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearnedNoise:
-    """Posterior of the noise.
+    """Posterior of the noise."""
 
-    Attributes
-    ----------
-    posterior : Gaussian
-        Of the logarithms of the family's quantities.
-    quantities : tuple of LearnedQuantity
-        For a reader: standard deviation and length of the smooth part (at which its correlation is
-        that of a Matérn correlation at its length), and all others; the rough part includes the
-        resolution.
-    noise : ObservationNoise
-        At the mean, added columns included.
-    covariance : (p, p) in filter coordinates
-        Added to the covariance of the estimate by the uncertainty of θ.
-    """
-
-    posterior: Gaussian
+    posterior: Gaussian  #: of the logarithms of the family's quantities
+    #: for a reader: standard deviation and length of the smooth part (at which its correlation is
+    #: that of a Matérn correlation at its length), and all others; the rough part includes the
+    #: resolution
     quantities: tuple[LearnedQuantity, ...]
-    noise: ObservationNoise
+    noise: ObservationNoise  #: at the mean, added columns included
+    #: (p, p) in filter coordinates, added to the covariance of the estimate by the uncertainty of θ
     covariance: FloatArray
 
 

@@ -19,12 +19,6 @@ DEFINITENESS_TOLERANCE = 1e-12
 class Gaussian:
     """Normal distribution N(m, P) of p parameters.
 
-    Attributes
-    ----------
-    mean : (p,) in units of each parameter
-    covariance : (p, p) in products of these units
-        Symmetric positive semi-definite. A zero variance holds a parameter fixed.
-
     Raises
     ------
     InputError
@@ -32,7 +26,9 @@ class Gaussian:
         semi-definite; the message gives the offending values.
     """
 
-    mean: FloatArray
+    mean: FloatArray  #: (p,) in units of each parameter
+    #: (p, p) in products of these units, symmetric positive semi-definite. A zero variance holds a
+    #: parameter fixed.
     covariance: FloatArray
 
     def __post_init__(self) -> None:

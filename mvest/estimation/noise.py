@@ -34,21 +34,12 @@ LARGEST = 300.0
 
 @dataclass(frozen=True, slots=True)
 class ObservationNoise:
-    """Noise of n observations with covariance R.
+    """Noise of n observations with covariance R."""
 
-    Attributes
-    ----------
-    size : int
-        Number n of observations.
-    log_determinant : float
-        log det R.
-    whiten : function from (n,) or (n, p) to the same shape
-        Multiplies with W, where Wᵀ W = R⁻¹; whitened noise has the covariance I. Row i of the
-        result belongs to observation i.
-    """
-
-    size: int
-    log_determinant: float
+    size: int  #: number n of observations
+    log_determinant: float  #: log det R
+    #: function from (n,) or (n, p) to the same shape, multiplies with W, where Wᵀ W = R⁻¹; whitened
+    #: noise has the covariance I. Row i of the result belongs to observation i.
     whiten: Callable[[FloatArray], FloatArray]
 
 
@@ -169,27 +160,14 @@ def low_rank_noise(base: ObservationNoise, columns: FloatArray) -> ObservationNo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseBlock:
-    """Points with the same kind of error, independent of other blocks.
+    """Points with the same kind of error, independent of other blocks."""
 
-    Attributes
-    ----------
-    rough : str
-        Name of the standard deviation τ of the rough part.
-    scale : (k,)
-        Factor of each point on the standard deviations.
-    coordinates : int
-        Observed coordinates of each point; they are independent and follow one another.
-    basis : Basis or None
-        Of the smooth part, if there is one.
-    frame : str or None
-        Name of a further factor f on all standard deviations of the block.
-    """
-
-    rough: str
-    scale: FloatArray
+    rough: str  #: name of the standard deviation τ of the rough part
+    scale: FloatArray  #: (k,), factor of each point on the standard deviations
+    #: observed coordinates of each point; they are independent and follow one another
     coordinates: int = 1
-    basis: Basis | None = None
-    frame: str | None = None
+    basis: Basis | None = None  #: of the smooth part, if there is one
+    frame: str | None = None  #: name of a further factor f on all standard deviations of the block
 
     @property
     def size(self) -> int:
@@ -221,21 +199,13 @@ class NoiseBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorColumns:
-    """Noise s² C Cᵀ of q independent unknown quantities.
+    """Noise s² C Cᵀ of q independent unknown quantities."""
 
-    Attributes
-    ----------
-    name : str
-        Of the factor s.
-    columns : (n, q) in units of the observation
-        C: change of the observation by one standard deviation of each quantity.
-    factor : float
-        One standard deviation of s, about 1; 1 fixes it.
-    """
-
-    name: str
+    name: str  #: of the factor s
+    #: (n, q) in units of the observation, C: change of the observation by one standard deviation of
+    #: each quantity
     columns: FloatArray
-    factor: float = 1.0
+    factor: float = 1.0  #: one standard deviation of s, about 1; 1 fixes it
 
 
 class VarianceTerms(NamedTuple):
@@ -257,30 +227,18 @@ class NoiseFamily:
 
     Code that expects a fixed noise gets the noise at the medians.
 
-    Attributes
-    ----------
-    blocks : tuple of NoiseBlock
-        One after another in the observation.
-    quantities : mapping of str to LogNormal
-        Prior of the rough parts and of the factors of frames.
-    bands : Gaussian or None
-        Prior of the logarithms of s_b ``(BANDS,)``; needed if there is a smooth part.
-    resolution : float
-        δ.
-    columns : tuple of ErrorColumns
-        Added noise.
-
     Raises
     ------
     InputError
         If the blocks' quantities are not those given, or names repeat.
     """
 
-    blocks: tuple[NoiseBlock, ...]
-    quantities: Mapping[str, LogNormal]
+    blocks: tuple[NoiseBlock, ...]  #: one after another in the observation
+    quantities: Mapping[str, LogNormal]  #: prior of the rough parts and of the factors of frames
+    #: prior of the logarithms of s_b ``(BANDS,)``; needed if there is a smooth part
     bands: Gaussian | None = None
-    resolution: float = 0.0
-    columns: tuple[ErrorColumns, ...] = ()
+    resolution: float = 0.0  #: δ
+    columns: tuple[ErrorColumns, ...] = ()  #: added noise
 
     def __post_init__(self) -> None:
         needed = {block.rough for block in self.blocks}

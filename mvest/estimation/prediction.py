@@ -14,20 +14,6 @@ from mvest.typing import FloatArray, IntArray
 class Prediction:
     """Predicted observation h(m) and its Jacobian H = dh/dm, or the reason why there is none.
 
-    Attributes
-    ----------
-    y : (n,) in units of the observation
-        Predicted observation; empty if the model failed.
-    jacobian : (n, p) in units of the observation per unit of each parameter
-        Derivative of `y`; empty if the model failed, of shape (n, 0) if the model does not
-        differentiate (`Prediction.undifferentiated`).
-    converged : bool
-        False if the model has no solution. Filters then read only `reason`.
-    reason : str
-        Why the model stopped; not empty if it failed.
-    aux : object
-        Anything else for the caller of the filter, which ignores it.
-
     Raises
     ------
     InputError
@@ -35,11 +21,15 @@ class Prediction:
         has values or no reason.
     """
 
+    #: (n,) in units of the observation, predicted observation; empty if the model failed
     y: FloatArray
+    #: (n, p) in units of the observation per unit of each parameter, derivative of `y`; empty if
+    #: the model failed, of shape (n, 0) if the model does not differentiate
+    #: (`Prediction.undifferentiated`)
     jacobian: FloatArray
-    converged: bool = True
-    reason: str = "converged"
-    aux: object = None
+    converged: bool = True  #: False if the model has no solution. Filters then read only `reason`.
+    reason: str = "converged"  #: why the model stopped; not empty if it failed
+    aux: object = None  #: object, anything else for the caller of the filter, which ignores it
 
     def __post_init__(self) -> None:
         y = read_only(self.y)

@@ -59,23 +59,16 @@ class SampledPosterior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledErrors:
-    """Samples of the error of an innovation, in addition to other noise.
+    """Samples of the error of an innovation, in addition to other noise."""
 
-    Attributes
-    ----------
-    base : ObservationNoise
-        R of n observations.
-    samples : (n, K) in units of the observation
-    source : (K,) or None
-        Samples with the same number are not independent; K₋ₖ leaves all of them out, and Student's
-        distribution has one degree of freedom for each source. None: all are independent.
-    beside : (n, q) or None
-        C: one standard deviation of each error that is part of the base but not of the samples.
-    """
-
-    base: ObservationNoise
-    samples: FloatArray
+    base: ObservationNoise  #: R of n observations
+    samples: FloatArray  #: (n, K) in units of the observation
+    #: (K,) or None, samples with the same number are not independent; K₋ₖ leaves all of them out,
+    #: and Student's distribution has one degree of freedom for each source. None: all are
+    #: independent.
     source: IntArray | None = None
+    #: (n, q) or None, C: one standard deviation of each error that is part of the base but not of
+    #: the samples
     beside: FloatArray | None = None
 
     def __post_init__(self) -> None:

@@ -33,14 +33,10 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """z = log m for positive parameters; every iterate and interval stays positive.
+    """z = log m for positive parameters; every iterate and interval stays positive."""
 
-    Attributes
-    ----------
-    positive : tuple of bool, one for each parameter, or None
-        Which parameters are taken in logarithms; None takes all.
-    """
-
+    #: tuple of bool, one for each parameter, or None, which parameters are taken in logarithms;
+    #: None takes all
     positive: tuple[bool, ...] | None = None
 
     def forward(self, m: FloatArray, /) -> FloatArray:

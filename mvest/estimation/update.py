@@ -17,24 +17,14 @@ both fit the second-level cache."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Update:
-    """Outcome of one Kalman update.
+    """Outcome of one Kalman update."""
 
-    Attributes
-    ----------
-    posterior : Gaussian
-        N(m⁺, P⁺).
-    log_likelihood : float
-        log N(e; 0, S) of the innovation, the evidence of the linear model.
-    nis : float
-        Normalised innovation squared eᵀ S⁻¹ e.
-    standardised_innovation : (n,)
-        S^(-1/2) e in the noise's whitened coordinates. If the model and its covariances are right,
-        these are standard normal numbers, and ``nis`` is chi-square with n degrees of freedom.
-    """
-
-    posterior: Gaussian
-    log_likelihood: float
-    nis: float
+    posterior: Gaussian  #: N(m⁺, P⁺)
+    log_likelihood: float  #: log N(e; 0, S) of the innovation, the evidence of the linear model
+    nis: float  #: normalised innovation squared eᵀ S⁻¹ e
+    #: (n,), S^(-1/2) e in the noise's whitened coordinates. If the model and its covariances are
+    #: right, these are standard normal numbers, and ``nis`` is chi-square with n degrees of
+    #: freedom.
     standardised_innovation: FloatArray
 
 

@@ -28,21 +28,12 @@ Positions = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class SparsityPattern:
-    """Positions of the blocks of a matrix: the upper triangle by rows, then the skew part.
+    """Positions of the blocks of a matrix: the upper triangle by rows, then the skew part."""
 
-    Attributes
-    ----------
-    pointer : ndarray
-        ``(n + 1,)`` start of each row of the upper triangle, which begins with its diagonal block.
-    columns : ndarray
-        ``(u,)`` sorted in each row.
-    skew : ndarray
-        ``(s, 2)`` sorted rows and columns of the skew blocks, with row <= column.
-    """
-
+    #: ``(n + 1,)`` start of each row of the upper triangle, which begins with its diagonal block
     pointer: Positions
-    columns: Positions
-    skew: IntArray
+    columns: Positions  #: ``(u,)`` sorted in each row
+    skew: IntArray  #: ``(s, 2)`` sorted rows and columns of the skew blocks, with row <= column
 
     @classmethod
     def of(cls, coupled: sparse.csr_matrix, skew: IntArray) -> SparsityPattern:
@@ -123,17 +114,11 @@ class SparsityPattern:
 
 @dataclass(frozen=True, eq=False)
 class BlockMatrix:
-    """A symmetric matrix of 3x3 blocks with a small skew part.
-
-    Attributes
-    ----------
-    pattern : SparsityPattern
-    blocks : ndarray
-        ``(u + s, 3, 3)``; each stands for its mirror image as well: its transpose, or its negative
-        transpose in the skew part.
-    """
+    """A symmetric matrix of 3x3 blocks with a small skew part."""
 
     pattern: SparsityPattern
+    #: ``(u + s, 3, 3)``; each stands for its mirror image as well: its transpose, or its negative
+    #: transpose in the skew part
     blocks: FloatArray
 
     @property

@@ -87,35 +87,21 @@ EXPONENTIAL_KINDS = ("c0", "c1", "c2", "mu", "kappa")
 
 @dataclass(frozen=True, slots=True)
 class TissueSettings:
-    """Material of one region. Parameters of an estimate override these values.
+    """Material of one region. Parameters of an estimate override these values."""
 
-    Attributes
-    ----------
-    ratio : float
-        E_f over E_perp.
-    nu : float
-        Poisson ratio of the paper.
-    reading : str
-        ``A`` or ``C`` (see :class:`mvest.mechanics.law.moduli.PoissonReading`).
-    law : str
-        ``biot``: the linear law, with all of the above. ``corotational``: its usual form on linear
-        tetrahedra (:mod:`mvest.mechanics.law.biot`). ``exponential``
-        (:mod:`mvest.mechanics.law.exponential`). ``stiffening``: a blend of linear and exponential.
-    exponential : ExponentialTissue, optional
-        Coefficients of the exponential law; their common scale has no effect on a stiffening one.
-    stiffening : float
-        Share of the exponential law over that of the linear one in a blend.
-    prestretch : float
-        In-plane stretch of the imaged open leaflet relative to its stress-free state
-        (:mod:`mvest.mechanics.law.regional`); not with the corotational law.
-    """
-
-    ratio: Ratio
-    nu: PoissonRatio = 0.488
-    reading: str = "A"
+    ratio: Ratio  #: E_f over E_perp
+    nu: PoissonRatio = 0.488  #: Poisson ratio of the paper
+    reading: str = "A"  #: ``A`` or ``C`` (see :class:`mvest.mechanics.law.moduli.PoissonReading`)
+    #: ``biot``: the linear law, with all of the above. ``corotational``: its usual form on linear
+    #: tetrahedra (:mod:`mvest.mechanics.law.biot`). ``exponential``
+    #: (:mod:`mvest.mechanics.law.exponential`). ``stiffening``: a blend of linear and exponential.
     law: str = "biot"
+    #: coefficients of the exponential law; their common scale has no effect on a stiffening one
     exponential: ExponentialTissue | None = None
+    #: share of the exponential law over that of the linear one in a blend
     stiffening: Stiffening = 0.0
+    #: in-plane stretch of the imaged open leaflet relative to its stress-free state
+    #: (:mod:`mvest.mechanics.law.regional`); not with the corotational law
     prestretch: Stretch = 1.0
 
     def __post_init__(self) -> None:
@@ -157,21 +143,11 @@ class TissueSettings:
 
 @dataclass(frozen=True, slots=True)
 class ModulusField:
-    """Prior of the variation of the modulus within a leaflet.
+    """Prior of the variation of the modulus within a leaflet."""
 
-    Attributes
-    ----------
-    correlation_length_mm : float
-        l of the squared exponential covariance.
-    std_log : float
-        Standard deviation of log E_f at a point.
-    modes : int
-        Number of modes.
-    """
-
-    correlation_length_mm: Length
-    std_log: Logarithm
-    modes: Count
+    correlation_length_mm: Length  #: l of the squared exponential covariance
+    std_log: Logarithm  #: standard deviation of log E_f at a point
+    modes: Count  #: number of modes
 
     def __post_init__(self) -> None:
         require_numbers(self, "field", "correlation_length_mm", "std_log")
@@ -184,21 +160,12 @@ class StiffPatch:
 
     ``log E_f`` is raised by ``log(factor) (1 - d^2 / radius^2)^2`` at distances d in the reference
     frame below ``radius``.
-
-    Attributes
-    ----------
-    region : str
-    centre : tuple of float
-        ``(x, y, z)`` mm in the reference frame.
-    radius_mm : float
-    factor : float
-        On the stiffness at the centre.
     """
 
     region: str
-    centre: tuple[Place, ...]
+    centre: tuple[Place, ...]  #: ``(x, y, z)`` mm in the reference frame
     radius_mm: Length
-    factor: Factor
+    factor: Factor  #: on the stiffness at the centre
 
     def __post_init__(self) -> None:
         if len(self.centre) != 3 or not np.all(np.isfinite(self.centre)):
@@ -213,34 +180,18 @@ class StiffPatch:
 
 @dataclass(frozen=True, slots=True)
 class ClosureProtocol:
-    """The course of a closure.
+    """The course of a closure."""
 
-    Attributes
-    ----------
-    pressure_mmHg : float
-        Peak transmitral pressure.
-    ramp : float
-        s over which pressure and boundary motion rise (smooth step).
-    dt : float
-        s, time step during the ramp. A unique closed state does not depend on it (the gate divides
-        it by up to 16), so that by default the ramp is one step.
-    growth : float
-        Growth factor of the steps after the ramp.
-    end : float
-        s, end of the dynamic phase.
-    equilibrium : bool
-        Whether a static step to exact equilibrium follows.
-    curve : tuple of (s, share)
-        Pressure over its peak at increasing times, a monotone cubic in between and constant
-        outside. If empty, the pressure rises with the motion of the boundary.
-    """
-
-    pressure_mmHg: Pressure = 120.0
-    ramp: BeatTime = 0.3
+    pressure_mmHg: Pressure = 120.0  #: peak transmitral pressure
+    ramp: BeatTime = 0.3  #: s over which pressure and boundary motion rise (smooth step)
+    #: s, time step during the ramp. A unique closed state does not depend on it (the gate divides
+    #: it by up to 16), so that by default the ramp is one step.
     dt: TimeStep = 0.3
-    growth: Factor = 1.5
-    end: BeatTime = 0.5
-    equilibrium: bool = True
+    growth: Factor = 1.5  #: growth factor of the steps after the ramp
+    end: BeatTime = 0.5  #: s, end of the dynamic phase
+    equilibrium: bool = True  #: whether a static step to exact equilibrium follows
+    #: tuple of (s, share), pressure over its peak at increasing times, a monotone cubic in between
+    #: and constant outside. If empty, the pressure rises with the motion of the boundary.
     curve: tuple[tuple[Factor, ...], ...] = ()
 
     def __post_init__(self) -> None:
@@ -285,24 +236,13 @@ class ClosureProtocol:
 
 @dataclass(frozen=True, slots=True)
 class ContactSettings:
-    """The contact law.
+    """The contact law."""
 
-    Attributes
-    ----------
-    reference_pressure : float
-        Contact pressure p0 (MPa) at the reference distance.
-    reference_distance : float
-        c0, midsurface distance at p0 over the thickness.
-    activation_distance : float
-        c_h, midsurface distance at which contact begins, over the thickness.
-    active : bool
-        Without contact leaflets pass through each other.
-    """
-
-    reference_pressure: Modulus = 0.016
-    reference_distance: Thicknesses = 1.2
+    reference_pressure: Modulus = 0.016  #: contact pressure p0 (MPa) at the reference distance
+    reference_distance: Thicknesses = 1.2  #: c0, midsurface distance at p0 over the thickness
+    #: c_h, midsurface distance at which contact begins, over the thickness
     activation_distance: Thicknesses = 2.0
-    active: bool = True
+    active: bool = True  #: without contact leaflets pass through each other
 
     def __post_init__(self) -> None:
         if not self.reference_pressure > 0:

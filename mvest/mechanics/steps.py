@@ -21,17 +21,10 @@ class StepReason(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Damping:
-    """Rayleigh damping ``C = alpha M + beta K``.
+    """Rayleigh damping ``C = alpha M + beta K``."""
 
-    Attributes
-    ----------
-    alpha : float
-        1/s, mass-proportional.
-    beta : float
-        s, stiffness-proportional; applied to the strain rate (see :mod:`mvest.mechanics.law.biot`).
-    """
-
-    alpha: DampingRate = 0.1
+    alpha: DampingRate = 0.1  #: 1/s, mass-proportional
+    #: s, stiffness-proportional; applied to the strain rate (see :mod:`mvest.mechanics.law.biot`)
     beta: DampingRate = 0.1
 
     def __post_init__(self) -> None:
@@ -41,33 +34,18 @@ class Damping:
 
 @dataclass(frozen=True, slots=True)
 class NewtonSettings:
-    """How each step is solved.
+    """How each step is solved."""
 
-    Attributes
-    ----------
-    tolerance : float
-        Norm of the residual over the norm of the largest force.
-    path_tolerance : float
-        The same for intermediate steps if only the final equilibrium is needed.
-    max_iterations : int
-    max_halvings : int
-        Largest number of halvings of a failing step.
-    single_solve : bool
-        One exact linear solve per step, SOFA's default: linearised at the current state, without
-        load stiffness and without a check of convergence.
-    largest_move : float
-        Largest move of a node in one iteration, mm.
-    smallest_move : float
-        mm; a smaller correction is round-off and counts as converged.
-    """
-
-    tolerance: Tolerance = 1e-9
+    tolerance: Tolerance = 1e-9  #: norm of the residual over the norm of the largest force
+    #: the same for intermediate steps if only the final equilibrium is needed
     path_tolerance: Tolerance = 1e-1
     max_iterations: Count = 60
-    max_halvings: Halvings = 8
+    max_halvings: Halvings = 8  #: largest number of halvings of a failing step
+    #: one exact linear solve per step, SOFA's default: linearised at the current state, without
+    #: load stiffness and without a check of convergence
     single_solve: bool = False
-    largest_move: Length = 4.0
-    smallest_move: Length = 1e-10
+    largest_move: Length = 4.0  #: largest move of a node in one iteration, mm
+    smallest_move: Length = 1e-10  #: mm; a smaller correction is round-off and counts as converged
 
     def __post_init__(self) -> None:
         positive = self.tolerance > 0 and self.path_tolerance > 0

@@ -42,19 +42,11 @@ class Pacing(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldState:
-    """Boundary conditions of a closed valve in a further frame.
-
-    Attributes
-    ----------
-    pressure_mmHg : float
-    annulus : (k, 3) mm
-        Of the annulus vertices of the *contact valve*.
-    papillary_tips : (t, 3) mm
-    """
+    """Boundary conditions of a closed valve in a further frame."""
 
     pressure_mmHg: float
-    annulus: FloatArray
-    papillary_tips: FloatArray
+    annulus: FloatArray  #: (k, 3) mm, of the annulus vertices of the *contact valve*
+    papillary_tips: FloatArray  #: (t, 3) mm
 
 
 def build_system(

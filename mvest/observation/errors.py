@@ -45,15 +45,9 @@ def observe(
 
 @dataclass(frozen=True, slots=True)
 class WhiteNoise:
-    """Independent normal noise of each coordinate of each vertex in each frame.
+    """Independent normal noise of each coordinate of each vertex in each frame."""
 
-    Attributes
-    ----------
-    std : float
-        mm.
-    """
-
-    std: float
+    std: float  #: mm
 
     def __post_init__(self) -> None:
         require_numbers(self, "noise", "std", least=0)
@@ -68,20 +62,12 @@ class SpatialCorrelation:
     """Matérn correlation, of smoothness 3/2, between points of the leaflets at rest.
 
     `matern` of the straight distance; the fields are once differentiable. C(l) = 0.48.
-
-    Attributes
-    ----------
-    points : (n, 3) mm
-        Vertices at rest.
-    length : float
-        Correlation length l, mm.
-    factor : (n, n)
-        Lower triangular L with L Lᵀ = C and rows of length one; 3248 vertices take a second and
-        84 MB.
     """
 
-    points: FloatArray
-    length: float
+    points: FloatArray  #: (n, 3) mm, vertices at rest
+    length: float  #: correlation length l, mm
+    #: (n, n), lower triangular L with L Lᵀ = C and rows of length one; 3248 vertices take a second
+    #: and 84 MB
     factor: FloatArray = field(init=False, repr=False)
     _parts: dict[bytes, SpatialCorrelation] = field(default_factory=dict, init=False, repr=False)
 
@@ -127,15 +113,9 @@ class CorrelatedNoise:
     """Normal noise that is correlated between neighbouring vertices, as errors of tracking are.
 
     Coordinates and frames are independent.
-
-    Attributes
-    ----------
-    std : float
-        mm, of each coordinate at every vertex.
-    correlation : SpatialCorrelation
     """
 
-    std: float
+    std: float  #: mm, of each coordinate at every vertex
     correlation: SpatialCorrelation
 
     def __post_init__(self) -> None:
@@ -159,17 +139,10 @@ class CoaptationDropout:
 
     A vertex is hidden in a frame in which it is nearer than ``distance`` to another leaflet, if it
     was not so near at rest. So the commissures, where leaflets are joined, stay visible.
-
-    Attributes
-    ----------
-    distance : float
-        mm, between midsurfaces.
-    surface : LeafletSurface
-        At rest.
     """
 
-    distance: float
-    surface: LeafletSurface
+    distance: float  #: mm, between midsurfaces
+    surface: LeafletSurface  #: at rest
 
     def __post_init__(self) -> None:
         require_numbers(self, "drop-out", "distance", least=0)
@@ -206,14 +179,10 @@ class AnnulusOffset:
     The model is bounded by the observed annulus, so that in its coordinates the leaflets (and the
     papillary tips, which are not observed) are displaced by ``offset``. The model's geometry comes
     from the open frame, which agrees with it.
-
-    Attributes
-    ----------
-    offset : (float, float, float)
-        mm, of the leaflets against the annulus; in the template x runs between the commissures, y
-        from posterior to anterior, z along the axis.
     """
 
+    #: (float, float, float), mm, of the leaflets against the annulus; in the template x runs
+    #: between the commissures, y from posterior to anterior, z along the axis
     offset: tuple[float, float, float]
 
     def __post_init__(self) -> None:

@@ -52,33 +52,21 @@ UNKNOWN = -1
 class ObservedSurface:
     """One frame seen without correspondence.
 
-    Attributes
-    ----------
-    frame : str
-        Name of the frame that the model predicts.
-    points : (q, 3) mm
-        Points on the leaflets.
-    region : (q,)
-        Leaflet of each point, or ``UNKNOWN`` (-1).
-    free_edge : (j, 3) mm or None
-        Closed curve along the free edge; the last point joins the first.
-    scale : (q,) or None
-        Standard deviation of each point over that of the observation; None: all 1.
-    free_edge_region : (j,) or None
-        Leaflet of each point of the free edge, with whose edge alone it is compared; ``UNKNOWN``
-        for points that are not compared. None: all are compared with the whole edge.
-
     Raises
     ------
     InputError
         On wrong shapes, values that are not finite, and curves whose points coincide.
     """
 
-    frame: str
-    points: FloatArray
-    region: IntArray
+    frame: str  #: name of the frame that the model predicts
+    points: FloatArray  #: (q, 3) mm, points on the leaflets
+    region: IntArray  #: (q,), leaflet of each point, or ``UNKNOWN`` (-1)
+    #: (j, 3) mm or None, closed curve along the free edge; the last point joins the first
     free_edge: FloatArray | None = None
+    #: (q,) or None, standard deviation of each point over that of the observation; None: all 1
     scale: FloatArray | None = None
+    #: (j,) or None, leaflet of each point of the free edge, with whose edge alone it is compared;
+    #: ``UNKNOWN`` for points that are not compared. None: all are compared with the whole edge.
     free_edge_region: IntArray | None = None
 
     def __post_init__(self) -> None:
@@ -144,26 +132,14 @@ class ObservedSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedSurface:
-    """A refined and smoothed surface through the positions that a model predicts.
+    """A refined and smoothed surface through the positions that a model predicts."""
 
-    Attributes
-    ----------
-    triangles : (m, 3)
-        Of the refined vertices; their normals point to one side throughout.
-    region : (m,)
-        Leaflet of each triangle.
-    weights : (r, n) sparse
-        The refined vertices in terms of the predicted ones.
-    width : float
-        mm, over which the surface is smoothed.
-    free_edge : (e,) or None
-        Refined vertices in loop order; None if the curve is not compared.
-    """
-
+    #: (m, 3), of the refined vertices; their normals point to one side throughout
     triangles: IntArray
-    region: IntArray
-    weights: csr_array
-    width: float
+    region: IntArray  #: (m,), leaflet of each triangle
+    weights: csr_array  #: (r, n) sparse, the refined vertices in terms of the predicted ones
+    width: float  #: mm, over which the surface is smoothed
+    #: (e,) or None, refined vertices in loop order; None if the curve is not compared
     free_edge: IntArray | None = None
 
     @classmethod
@@ -219,22 +195,6 @@ class SurfaceObservation:
     The observation of each frame is the distances of its points, then two components of each point
     of the free edge. The model predicts these distances; zero is observed.
 
-    Attributes
-    ----------
-    seen : tuple of ObservedSurface, (f,)
-        One for each observed frame, the closed one last.
-    surface : PredictedSurface
-    std_mm : float
-        Standard deviation of the points along the normal, and of each component of the points of
-        the free edge.
-    correlation_length_mm : float
-        Correlation length of the errors of the distances, see `SpatialCorrelation`, within a frame
-        and a leaflet; 0: independent. Errors of the free edge are independent.
-    predicted : tuple of str
-        Frames that the model predicts, in the order in which it stacks them.
-    R : NoiseCovariance
-        Covariance in mm² of the observation.
-
     Raises
     ------
     InputError
@@ -242,12 +202,18 @@ class SurfaceObservation:
         does not have.
     """
 
+    #: tuple of ObservedSurface, (f,), one for each observed frame, the closed one last
     seen: tuple[ObservedSurface, ...]
     surface: PredictedSurface
+    #: standard deviation of the points along the normal, and of each component of the points of the
+    #: free edge
     std_mm: float
+    #: correlation length of the errors of the distances, see `SpatialCorrelation`, within a frame
+    #: and a leaflet; 0: independent. Errors of the free edge are independent.
     correlation_length_mm: float = 0.0
+    #: frames that the model predicts, in the order in which it stacks them
     predicted: tuple[str, ...] = FRAMES
-    R: NoiseCovariance = field(init=False, repr=False)
+    R: NoiseCovariance = field(init=False, repr=False)  #: covariance in mm² of the observation
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seen", tuple(self.seen))

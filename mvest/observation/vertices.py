@@ -30,29 +30,17 @@ FRAMES = ("open", "closed")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """Observed positions of vertices, with the assumed noise.
+    """Observed positions of vertices, with the assumed noise."""
 
-    Attributes
-    ----------
-    frames : tuple of str, (f,)
-        Observed frames, the closed one last.
-    positions : (f, n, 3) mm
-        Positions of the vertices in each frame; NaN for vertices that are not seen.
-    variance : (f,) mm²
-        Assumed variance of each coordinate in each frame.
-    correlation : SpatialCorrelation or None
-        Assumed correlation between vertices; None for independent errors.
-    scale : (n,) or None
-        Standard deviation of each vertex over that of its frame; None: all 1.
-    predicted : tuple of str
-        Frames that the model predicts, in the order in which it stacks them.
-    """
-
-    frames: tuple[str, ...]
+    frames: tuple[str, ...]  #: tuple of str, (f,), observed frames, the closed one last
+    #: (f, n, 3) mm, positions of the vertices in each frame; NaN for vertices that are not seen
     positions: FloatArray
-    variance: FloatArray
+    variance: FloatArray  #: (f,) mm², assumed variance of each coordinate in each frame
+    #: assumed correlation between vertices; None for independent errors
     correlation: SpatialCorrelation | None = None
+    #: (n,) or None, standard deviation of each vertex over that of its frame; None: all 1
     scale: FloatArray | None = None
+    #: frames that the model predicts, in the order in which it stacks them
     predicted: tuple[str, ...] = FRAMES
 
     def __post_init__(self) -> None:

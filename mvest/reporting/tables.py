@@ -68,17 +68,10 @@ class Column:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """Rows of plain values under named columns.
+    """Rows of plain values under named columns."""
 
-    Attributes
-    ----------
-    values : mapping of str to list
-        Column -> its values; None if a value is missing.
-    columns : mapping of str to Column
-        Meaning of columns; one that is not named here has no unit.
-    """
-
-    values: Mapping[str, Sequence[Any]]
+    values: Mapping[str, Sequence[Any]]  #: column -> its values; None if a value is missing
+    #: meaning of columns; one that is not named here has no unit
     columns: Mapping[str, Column] = field(default_factory=dict)
 
     def __len__(self) -> int:

@@ -62,23 +62,12 @@ class Sample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedScenario:
-    """Prediction of a valve under one scenario.
-
-    Attributes
-    ----------
-    at_estimate : Sample
-    shape : ndarray or None
-        ``(n, 3)`` mm, observed vertices at the estimate.
-    samples : tuple of Sample
-        Of the posterior, including failed ones.
-    finer : Sample or None
-        The same valve at the estimate on a finer mesh, if there is one.
-    """
+    """Prediction of a valve under one scenario."""
 
     at_estimate: Sample
-    shape: FloatArray | None
-    samples: tuple[Sample, ...]
-    finer: Sample | None = None
+    shape: FloatArray | None  #: ``(n, 3)`` mm, observed vertices at the estimate
+    samples: tuple[Sample, ...]  #: of the posterior, including failed ones
+    finer: Sample | None = None  #: the same valve at the estimate on a finer mesh, if there is one
 
     @property
     def failures(self) -> tuple[str, ...]:

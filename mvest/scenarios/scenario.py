@@ -30,14 +30,9 @@ class Annuloplasty:
     Every annulus point is moved along the anterior direction towards the commissural line (through
     the centre of the annulus, along the commissures), in proportion to its distance from it:
     ``y -> s y``. The commissural diameter and the heights along the normal do not change.
-
-    Attributes
-    ----------
-    percent : float
-        Reduction of the anteroposterior diameter.
     """
 
-    percent: Percent
+    percent: Percent  #: reduction of the anteroposterior diameter
 
     def __post_init__(self) -> None:
         if not 0 < self.percent < 100 * (1 - NARROWEST):
@@ -52,23 +47,13 @@ class Clip:
     """An edge-to-edge clip: pairs of points of the two leaflets that are tied together.
 
     The midsurfaces are held at the distance at which the contact carries its reference pressure.
-
-    Attributes
-    ----------
-    position_mm : float
-        Position of its middle along the commissures (0: A2 to P2), in the reference frame.
-    width_mm : float
-        Along the free edges.
-    grasp_mm : float
-        Distance from the free edges to which the leaflets are held.
-    stiffness : float
-        N/mm of each pair.
     """
 
+    #: position of its middle along the commissures (0: A2 to P2), in the reference frame
     position_mm: Place = 0.0
-    width_mm: Length = 5.0
-    grasp_mm: Length = 4.0
-    stiffness: Stiffness = 100.0
+    width_mm: Length = 5.0  #: along the free edges
+    grasp_mm: Length = 4.0  #: distance from the free edges to which the leaflets are held
+    stiffness: Stiffness = 100.0  #: N/mm of each pair
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.position_mm):
@@ -78,19 +63,10 @@ class Clip:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Changes of a valve; without any it is the valve as observed.
+    """Changes of a valve; without any it is the valve as observed."""
 
-    Attributes
-    ----------
-    title : str
-        Its name in a table.
-    pressure_mmHg : float or None
-        Peak transmitral pressure; None: that of the observed valve.
-    annuloplasty : Annuloplasty or None
-    clip : Clip or None
-    """
-
-    title: str
+    title: str  #: its name in a table
+    #: peak transmitral pressure; None: that of the observed valve
     pressure_mmHg: Pressure | None = None
     annuloplasty: Annuloplasty | None = None
     clip: Clip | None = None

@@ -106,31 +106,20 @@ class IteratedFilter(Filter):
 
     The filter stops if the next full step is below the tolerance, without taking it: the reported
     prediction is that of the estimate.
-
-    Attributes
-    ----------
-    tolerance : float
-        Stop when the next full step changes no parameter by more than this, relative to its size
-        (or to its standard deviation if that is larger).
-    objective_tolerance : float
-        Stop when the next full step would lower J, the negative logarithm of a probability, by less
-        than this, or by less than its rounding error.
-    max_iterations : int
-        Largest number of accepted steps.
-    start : (p,) parameters or None
-        First iterate; None starts at the prior's mean.
-    max_learned : int
-        Iterates at which the noise of a `NoiseFamily` is learned.
-    second_order : bool
-        Whether mode and covariance are computed with second derivatives, from 2p further runs, if
-        Gauss-Newton does not converge or the check of its posterior fails.
     """
 
+    #: stop when the next full step changes no parameter by more than this, relative to its size (or
+    #: to its standard deviation if that is larger)
     tolerance: float = 1e-4
+    #: stop when the next full step would lower J, the negative logarithm of a probability, by less
+    #: than this, or by less than its rounding error
     objective_tolerance: float = 1e-9
-    max_iterations: int = 20
+    max_iterations: int = 20  #: largest number of accepted steps
+    #: (p,) parameters or None, first iterate; None starts at the prior's mean
     start: tuple[float, ...] | None = None
-    max_learned: int = 12
+    max_learned: int = 12  #: iterates at which the noise of a `NoiseFamily` is learned
+    #: whether mode and covariance are computed with second derivatives, from 2p further runs, if
+    #: Gauss-Newton does not converge or the check of its posterior fails
     second_order: bool = False
 
     def __post_init__(self) -> None:

@@ -30,21 +30,15 @@ class PaperFilter(Filter):
     the covariance of a posterior: with Q = 0 it shrinks like 1/rounds, with Q > 0 it tends to a
     value set by Q and R. For a posterior use `IteratedFilter`. No step is shortened: the run ends
     if the model fails.
-
-    Attributes
-    ----------
-    Q : float, (p,) or (p, p) in squared units of the parameters
-        Covariance added in each round; transformed into filter coordinates at the prior's mean.
-    tolerance : float
-        Stop when no parameter changed by more than this, relative to its size (or to its standard
-        deviation if that is larger).
-    max_iterations : int
-        Largest number of rounds.
     """
 
+    #: float, (p,) or (p, p) in squared units of the parameters, covariance added in each round;
+    #: transformed into filter coordinates at the prior's mean
     Q: float | FloatArray = 0.01
+    #: stop when no parameter changed by more than this, relative to its size (or to its standard
+    #: deviation if that is larger)
     tolerance: float = 1e-4
-    max_iterations: int = 50
+    max_iterations: int = 50  #: largest number of rounds
 
     def __post_init__(self) -> None:
         require_numbers(self, "filter", "tolerance")

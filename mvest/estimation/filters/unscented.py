@@ -43,21 +43,13 @@ class UnscentedFilter(Filter):
 
     If a point has no prediction, its round is repeated with the points at half the distance, half
     way back to the previous mean. A step that is no smaller than the last one is halved.
-
-    Attributes
-    ----------
-    tolerance : float
-        Stop when a further round changes no parameter by more than this part of its size (or of its
-        standard deviation if that is larger).
-    max_iterations : int
-        Rounds. 1 is the filter of Moireau and Chapelle.
-    spread : float
-        Distance of the points from their mean; at 1 their covariance is P.
     """
 
+    #: stop when a further round changes no parameter by more than this part of its size (or of its
+    #: standard deviation if that is larger)
     tolerance: float = 1e-3
-    max_iterations: int = 15
-    spread: float = 1.0
+    max_iterations: int = 15  #: rounds. 1 is the filter of Moireau and Chapelle.
+    spread: float = 1.0  #: distance of the points from their mean; at 1 their covariance is P
 
     def __post_init__(self) -> None:
         require_numbers(self, "filter", "tolerance", "spread")

@@ -27,20 +27,12 @@ NOISE_RANGE = (1e-6, 1e6)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """Information of an observation about p parameters, for noise of unit standard deviation.
+    """Information of an observation about p parameters, for noise of unit standard deviation."""
 
-    Attributes
-    ----------
-    names : tuple of str, (p,)
-    values : (p,) in the units of the parameters
-        Positive; where the Jacobian was computed.
-    triangle : (p, p)
-        T.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  #: tuple of str, (p,)
+    #: (p,) in the units of the parameters, positive; where the Jacobian was computed
     values: FloatArray
-    triangle: FloatArray
+    triangle: FloatArray  #: (p, p), T
 
     @classmethod
     def of(

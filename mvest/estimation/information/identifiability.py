@@ -27,52 +27,33 @@ UNDETERMINED = ("not determined at all", "known to no better than its own size")
 
 @dataclass(frozen=True, slots=True)
 class TradeOff:
-    """Parameters that compensate each other in the data.
+    """Parameters that compensate each other in the data."""
 
-    Attributes
-    ----------
-    parameters : tuple of str, (q,)
-        The first is most correlated with the others.
-    changes : tuple of float, (q,)
-        Changes in their units that hardly affect the data together: the first by `STEP` of its
-        scale, the others by cov(i, first) / var(first) of that.
-    relative : tuple of float, (q,)
-        The same relative to their scales.
-    correlation : float
-        Smallest absolute correlation of the first with one of the others, at the bound.
-    """
-
-    parameters: tuple[str, ...]
+    parameters: tuple[str, ...]  #: tuple of str, (q,), the first is most correlated with the others
+    #: tuple of float, (q,), changes in their units that hardly affect the data together: the first
+    #: by `STEP` of its scale, the others by cov(i, first) / var(first) of that
     changes: tuple[float, ...]
-    relative: tuple[float, ...]
+    relative: tuple[float, ...]  #: tuple of float, (q,), the same relative to their scales
+    #: smallest absolute correlation of the first with one of the others, at the bound
     correlation: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identifiability:
-    """Fisher information of p parameters in units of their scales.
+    """Fisher information of p parameters in units of their scales."""
 
-    Attributes
-    ----------
-    names : tuple of str, (p,)
-    scale : (p,) in units of each parameter
-        A large change of each parameter; eigenvectors depend on it.
-    information : (p, p)
-        D Hᵀ R⁻¹ H D, D = diag(scale), plus D P⁻¹ D of a prior if given.
-    eigenvalues : (p,), ascending
-        A combination with eigenvalue λ has the standard deviation 1/√λ, relative to the scales.
-    eigenvectors : (p, p)
-        In columns; the first is the least known combination.
-    covariance : (p, p) in products of the parameters' units
-        Cramér-Rao bound: no unbiased estimator has a smaller covariance. Infinite (and NaN off the
-        diagonal) for parameters that the data leave undetermined.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  #: tuple of str, (p,)
+    #: (p,) in units of each parameter, A large change of each parameter; eigenvectors depend on it
     scale: FloatArray
+    #: (p, p), D Hᵀ R⁻¹ H D, D = diag(scale), plus D P⁻¹ D of a prior if given
     information: FloatArray
+    #: (p,), ascending, A combination with eigenvalue λ has the standard deviation 1/√λ, relative to
+    #: the scales
     eigenvalues: FloatArray
-    eigenvectors: FloatArray
+    eigenvectors: FloatArray  #: (p, p), in columns; the first is the least known combination
+    #: (p, p) in products of the parameters' units, cramér-Rao bound: no unbiased estimator has a
+    #: smaller covariance. Infinite (and NaN off the diagonal) for parameters that the data leave
+    #: undetermined.
     covariance: FloatArray
 
     @property

@@ -76,26 +76,19 @@ def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -
 class Command:
     """How to start a program, and how long it may take.
 
-    Attributes
-    ----------
-    arguments : tuple of str
-        The program and its arguments; no shell reads them. ``{request}`` and ``{folder}`` become
-        the request file and the folder of the run, in which the program runs; ``{here}`` becomes
-        the working folder of this process.
-    environment : mapping
-        Variables in addition to those of this process.
-    time_limit_s : float
-        The program and all its children are stopped after this time.
-
     Raises
     ------
     ConfigurationError
         The program does not exist, or the limit is not positive.
     """
 
+    #: the program and its arguments; no shell reads them. ``{request}`` and ``{folder}`` become the
+    #: request file and the folder of the run, in which the program runs; ``{here}`` becomes the
+    #: working folder of this process.
     arguments: tuple[str, ...]
+    #: variables in addition to those of this process
     environment: Mapping[str, str] = field(default_factory=dict)
-    time_limit_s: float = 600.0
+    time_limit_s: float = 600.0  #: the program and all its children are stopped after this time
 
     def __post_init__(self) -> None:
         if not self.arguments or not self.arguments[0]:

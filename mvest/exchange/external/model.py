@@ -28,20 +28,11 @@ class Differences:
 
     Their error is of second order in the step. The tolerance of the program's solver adds an error
     of tolerance over step: choose a step much larger than the tolerance.
-
-    Attributes
-    ----------
-    relative_step : float
-        Step over the size of a parameter.
-    floor : float
-        Least size of a parameter, in its unit; needed if it may be zero.
-    processes : int
-        Number of simultaneous runs.
     """
 
-    relative_step: float = 1e-3
-    floor: float = 0.0
-    processes: int = 1
+    relative_step: float = 1e-3  #: step over the size of a parameter
+    floor: float = 0.0  #: least size of a parameter, in its unit; needed if it may be zero
+    processes: int = 1  #: number of simultaneous runs
 
     def __post_init__(self) -> None:
         if not (0 < self.relative_step < 1 and self.floor >= 0 and self.processes >= 1):
@@ -91,13 +82,6 @@ class ProcessModel:
     differences : Differences or None
         How to differentiate if the program does not; None requires derivatives of the program.
 
-    Attributes
-    ----------
-    runs : int
-        Number of runs that were started.
-    own_jacobian : bool
-        Whether the program itself gave the last derivatives.
-
     Raises
     ------
     InputError, ConfigurationError
@@ -113,7 +97,8 @@ class ProcessModel:
     points: FloatArray | None = None
     settings: Mapping[str, Any] | None = None
     differences: Differences | None = Differences()
-    runs: int = field(default=0, init=False)
+    runs: int = field(default=0, init=False)  #: number of runs that were started
+    #: whether the program itself gave the last derivatives
     own_jacobian: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:

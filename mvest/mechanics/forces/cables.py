@@ -141,16 +141,10 @@ class Hinge:
 
     Thickness-averaged points make a hinge (rotation about the annulus is free), points on both
     faces a clamp. The stiffness is so high that the support moves by micrometres only.
-
-    Attributes
-    ----------
-    points : Embedding
-        ``(h,)``.
-    stiffness : (h,) N/mm
     """
 
-    points: Embedding
-    stiffness: FloatArray
+    points: Embedding  #: ``(h,)``
+    stiffness: FloatArray  #: (h,) N/mm
 
     def forces(self, x: FloatArray, target: FloatArray) -> FloatArray:
         """Internal forces ``(h, 3)`` N at the points."""
@@ -202,21 +196,13 @@ class TiedPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ties:
-    """Springs between pairs of material points.
+    """Springs between pairs of material points."""
 
-    Attributes
-    ----------
-    spans : Embedding
-        ``(k,)`` vectors from the second point of each pair to the first; the weights of a row sum
-        to zero.
-    stiffness : float
-        N/mm of each pair.
-    closed_length : float
-        mm, force-free length in the closed valve; the loads hold the current one.
-    """
-
+    #: ``(k,)`` vectors from the second point of each pair to the first; the weights of a row sum to
+    #: zero
     spans: Embedding
-    stiffness: float
+    stiffness: float  #: N/mm of each pair
+    #: mm, force-free length in the closed valve; the loads hold the current one
     closed_length: float = 0.0
 
     def lengths(self, x: FloatArray) -> FloatArray:

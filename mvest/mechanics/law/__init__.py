@@ -14,24 +14,12 @@ from mvest.typing import FloatArray, IntArray
 
 
 class Points(NamedTuple):
-    """State at the quadrature points of some elements.
+    """State at the quadrature points of some elements."""
 
-    Attributes
-    ----------
-    green : ndarray
-        ``(e, q, 6)`` Green-Lagrange strain.
-    region : ndarray
-        ``(e,)`` regions, counted from 0.
-    previous : ndarray
-        ``(e, q, 6)`` strain measure of the law at the start of the step.
-    rate : float
-        Stiffness-proportional damping over the step, ``beta / dt``; 0 in an equilibrium.
-    """
-
-    green: FloatArray
-    region: IntArray
-    previous: FloatArray
-    rate: float
+    green: FloatArray  #: ``(e, q, 6)`` Green-Lagrange strain
+    region: IntArray  #: ``(e,)`` regions, counted from 0
+    previous: FloatArray  #: ``(e, q, 6)`` strain measure of the law at the start of the step
+    rate: float  #: stiffness-proportional damping over the step, ``beta / dt``; 0 in an equilibrium
 
 
 @runtime_checkable

@@ -60,17 +60,11 @@ SCALE = np.array([1.0, 1.0, 1.0, ROOT, ROOT, ROOT])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BiotLaw:
-    """The law of a body: one stiffness per region, evaluated at all quadrature points at once.
+    """The law of a body: one stiffness per region, evaluated at all quadrature points at once."""
 
-    Attributes
-    ----------
-    stiffness : (n_regions, 6, 6) MPa
-    corotational : bool
-        Whether strain and stress are the linear ones in the rotated frame of the element
-        (:class:`mvest.mechanics.solid.EdgeRotations`).
-    """
-
-    stiffness: FloatArray
+    stiffness: FloatArray  #: (n_regions, 6, 6) MPa
+    #: whether strain and stress are the linear ones in the rotated frame of the element
+    #: (:class:`mvest.mechanics.solid.EdgeRotations`)
     corotational: bool = False
 
     @classmethod

@@ -77,15 +77,9 @@ VISCOUS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExponentialLaw:
-    """The law of a body with one set of coefficients per region.
+    """The law of a body with one set of coefficients per region."""
 
-    Attributes
-    ----------
-    coefficients : ndarray
-        ``(n_regions, 6)`` in the order of :class:`ExponentialTissue`.
-    """
-
-    coefficients: FloatArray
+    coefficients: FloatArray  #: ``(n_regions, 6)`` in the order of :class:`ExponentialTissue`
 
     @classmethod
     def of(cls, tissues: Sequence[ExponentialTissue]) -> ExponentialLaw:
@@ -316,20 +310,11 @@ def _scale(tissue: ExponentialTissue, linear: TissueSettings) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StiffeningLaw:
-    """Blend of the linear and the exponential law, for a body of one region.
-
-    Attributes
-    ----------
-    linear : BiotLaw
-    exponential : ExponentialLaw
-        Of the same stiffness at the stretches of closed leaflets.
-    stiffening : float
-        Share of the exponential law over that of the linear one, at least 0.
-    """
+    """Blend of the linear and the exponential law, for a body of one region."""
 
     linear: BiotLaw
-    exponential: ExponentialLaw
-    stiffening: float
+    exponential: ExponentialLaw  #: of the same stiffness at the stretches of closed leaflets
+    stiffening: float  #: share of the exponential law over that of the linear one, at least 0
 
     @classmethod
     def of(cls, tissue: TissueSettings, E_f: float, stiffening: float) -> StiffeningLaw:

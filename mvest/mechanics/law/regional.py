@@ -50,21 +50,11 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldBasis:
-    """The modes of one leaflet as functions of the point.
+    """The modes of one leaflet as functions of the point."""
 
-    Attributes
-    ----------
-    support : (s, 3) mm
-        Vertices of the leaflet.
-    combination : (s, k)
-        Factors on their covariances with a point.
-    length : float
-        mm.
-    """
-
-    support: FloatArray
-    combination: FloatArray
-    length: float
+    support: FloatArray  #: (s, 3) mm, vertices of the leaflet
+    combination: FloatArray  #: (s, k), factors on their covariances with a point
+    length: float  #: mm
 
     @classmethod
     def of(cls, surface: LeafletSurface, region: str, settings: ModulusField) -> FieldBasis:
@@ -126,18 +116,11 @@ def at_quadrature(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModulusVariation:
-    """Variation of the modulus within the leaflets, at the quadrature points of a mesh.
+    """Variation of the modulus within the leaflets, at the quadrature points of a mesh."""
 
-    Attributes
-    ----------
-    modes : mapping
-        Region -> ``(e, q, k)`` modes of its field, see `at_quadrature`.
-    given : ndarray or float
-        ``(e, q)`` part of log E_f that is not estimated.
-    """
-
+    #: region -> ``(e, q, k)`` modes of its field, see `at_quadrature`
     modes: Mapping[str, FloatArray]
-    given: FloatArray | float = 0.0
+    given: FloatArray | float = 0.0  #: ``(e, q)`` part of log E_f that is not estimated
 
     def scale(self, values: Mapping[str, float]) -> FloatArray:
         """Factor ``(e, q)`` on the stiffness; missing coefficients are 0."""
@@ -155,25 +138,12 @@ NORMAL = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeafletLaw:
-    """Laws of the regions of a mesh, with prestretch and varying stiffness.
+    """Laws of the regions of a mesh, with prestretch and varying stiffness."""
 
-    Attributes
-    ----------
-    laws : tuple of Law
-        One law of all regions, or one law of a single region for each.
-    region : ndarray
-        ``(e,)`` of the elements.
-    prestretch : ndarray
-        ``(r,)`` of each region.
-    scale : ndarray or float
-        Factor ``(e, q)`` on the stiffness from ``variation``.
-    variation : ModulusVariation, optional
-    """
-
-    laws: tuple[Law, ...]
-    region: IntArray
-    prestretch: FloatArray
-    scale: FloatArray | float = 1.0
+    laws: tuple[Law, ...]  #: one law of all regions, or one law of a single region for each
+    region: IntArray  #: ``(e,)`` of the elements
+    prestretch: FloatArray  #: ``(r,)`` of each region
+    scale: FloatArray | float = 1.0  #: factor ``(e, q)`` on the stiffness from ``variation``
     variation: ModulusVariation | None = None
 
     @property

@@ -46,20 +46,11 @@ class AnnulusDimensions:
 
 @dataclass(frozen=True, slots=True)
 class LeafletDimensions:
-    """One leaflet.
+    """One leaflet."""
 
-    Attributes
-    ----------
-    length : float
-        From annulus to free edge in the middle.
-    thickness : float
-        Of the half next to the annulus.
-    length_exponent : float
-        Exponent of the sine by which the length decreases towards the commissures.
-    """
-
-    length: Length
-    thickness: Thickness
+    length: Length  #: from annulus to free edge in the middle
+    thickness: Thickness  #: of the half next to the annulus
+    #: exponent of the sine by which the length decreases towards the commissures
     length_exponent: Factor = 1.2
 
 
@@ -128,18 +119,13 @@ class ClosedEdge:
 
 @dataclass(frozen=True, slots=True)
 class PapillaryPlace:
-    """Positions of the papillary tips.
+    """Positions of the papillary tips."""
 
-    Attributes
-    ----------
-    tip : (x, y, z)
-        The tip at positive x; the other one is its mirror image.
-    displacement : (x, y, z)
-        Displacement of this tip after the chordae got their lengths; the other tip moves as its
-        mirror image. The chordae tether the leaflets then, but are never taut in the open valve.
-    """
-
+    #: (x, y, z), the tip at positive x; the other one is its mirror image
     tip: tuple[Place, Place, Place] = (16.0, -0.24, -25.0)
+    #: (x, y, z), displacement of this tip after the chordae got their lengths; the other tip moves
+    #: as its mirror image. The chordae tether the leaflets then, but are never taut in the open
+    #: valve.
     displacement: tuple[Place, Place, Place] = (0.0, 0.0, 0.0)
 
 

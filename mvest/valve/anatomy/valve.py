@@ -122,19 +122,6 @@ def lumped_areas_change(vertices: FloatArray, triangles: IntArray, moves: FloatA
 class LeafletSurface:
     """Midsurface of all leaflets in the reference (open) frame.
 
-    Attributes
-    ----------
-    vertices : (n, 3) mm
-    triangles : ndarray
-        ``(m, 3)``; their normals point to the ventricle.
-    region : ndarray
-        ``(m,)`` leaflet of each triangle, an index into ``region_names``.
-    region_names : tuple of str
-    fibre : ndarray
-        ``(n, 3)`` unit vectors, collagen direction at the vertices.
-    thickness : ndarray
-        ``(n,)`` mm, positive.
-
     Raises
     ------
     InputError, GeometryError
@@ -142,12 +129,12 @@ class LeafletSurface:
         or fibres without direction.
     """
 
-    vertices: FloatArray
-    triangles: IntArray
-    region: IntArray
+    vertices: FloatArray  #: (n, 3) mm
+    triangles: IntArray  #: ``(m, 3)``; their normals point to the ventricle
+    region: IntArray  #: ``(m,)`` leaflet of each triangle, an index into ``region_names``
     region_names: tuple[str, ...]
-    fibre: FloatArray
-    thickness: FloatArray
+    fibre: FloatArray  #: ``(n, 3)`` unit vectors, collagen direction at the vertices
+    thickness: FloatArray  #: ``(n,)`` mm, positive
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -186,31 +173,15 @@ class LeafletSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chordae:
-    """Chordae tendineae: straight cables from a papillary tip to a point of the leaflets.
+    """Chordae tendineae: straight cables from a papillary tip to a point of the leaflets."""
 
-    Attributes
-    ----------
-    tip : ndarray
-        ``(c,)`` index of the papillary tip.
-    insertion : ndarray
-        ``(c, 3)`` mm, insertion on the midsurface in the reference frame.
-    family : ndarray
-        ``(c,)`` index into ``family_names`` (marginal, basal, ...).
-    family_names : tuple of str
-    rest_length : (c,) mm
-    axial_stiffness : ndarray
-        ``(c,)`` N, Young's modulus times cross section.
-    toe_strain : float
-        Strain over which the stiffness rises from zero to ``axial_stiffness``.
-    """
-
-    tip: IntArray
-    insertion: FloatArray
-    family: IntArray
+    tip: IntArray  #: ``(c,)`` index of the papillary tip
+    insertion: FloatArray  #: ``(c, 3)`` mm, insertion on the midsurface in the reference frame
+    family: IntArray  #: ``(c,)`` index into ``family_names`` (marginal, basal, ...)
     family_names: tuple[str, ...]
-    rest_length: FloatArray
-    axial_stiffness: FloatArray
-    toe_strain: float
+    rest_length: FloatArray  #: (c,) mm
+    axial_stiffness: FloatArray  #: ``(c,)`` N, Young's modulus times cross section
+    toe_strain: float  #: strain over which the stiffness rises from zero to ``axial_stiffness``
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -234,21 +205,13 @@ class Chordae:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Prescribed positions of annulus and papillary tips at key frames.
+    """Prescribed positions of annulus and papillary tips at key frames."""
 
-    Attributes
-    ----------
-    phase : ndarray
-        ``(f,)`` strictly increasing from 0 (reference frame) to 1 (closed frame). The loading
-        defines the phase as a function of time.
-    annulus : ndarray
-        ``(f, n_annulus, 3)`` mm; entry 0 equals the reference positions.
-    papillary_tips : (f, n_tips, 3) mm
-    """
-
+    #: ``(f,)`` strictly increasing from 0 (reference frame) to 1 (closed frame). The loading
+    #: defines the phase as a function of time.
     phase: FloatArray
-    annulus: FloatArray
-    papillary_tips: FloatArray
+    annulus: FloatArray  #: ``(f, n_annulus, 3)`` mm; entry 0 equals the reference positions
+    papillary_tips: FloatArray  #: (f, n_tips, 3) mm
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -263,28 +226,14 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Valve:
-    """One valve in one resolution.
-
-    Attributes
-    ----------
-    surface : LeafletSurface
-    annulus : ndarray
-        ``(k,)`` vertices of ``surface`` along the annulus, in loop order.
-    free_edge : ndarray
-        ``(k2,)`` vertices along the free edge, in loop order.
-    papillary_tips : ndarray
-        ``(n_tips, 3)`` mm in the reference frame.
-    chordae : Chordae
-    motion : Motion
-        Of the vertices ``annulus`` and of the tips.
-    """
+    """One valve in one resolution."""
 
     surface: LeafletSurface
-    annulus: IntArray
-    free_edge: IntArray
-    papillary_tips: FloatArray
+    annulus: IntArray  #: ``(k,)`` vertices of ``surface`` along the annulus, in loop order
+    free_edge: IntArray  #: ``(k2,)`` vertices along the free edge, in loop order
+    papillary_tips: FloatArray  #: ``(n_tips, 3)`` mm in the reference frame
     chordae: Chordae
-    motion: Motion
+    motion: Motion  #: of the vertices ``annulus`` and of the tips
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__

@@ -53,27 +53,15 @@ MAX_VOXELS = 4 * 10**7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeafletFields:
-    """Signed distances to the leaflets, positive inside, on a grid.
+    """Signed distances to the leaflets, positive inside, on a grid."""
 
-    Attributes
-    ----------
-    distance : (2, I, J, K) or (1, I, J, K) mm
-        To the anterior and to the posterior leaflet, or to both if they share one label.
-    union : (I, J, K) mm
-        To both leaflets together.
-    step : float
-        mm between grid points.
-    blur_mm : float
-        Standard deviation of the smoothing of the distances.
-    voxel_mm : float
-        Size of the original voxels, 0 for surfaces.
-    """
-
+    #: (2, I, J, K) or (1, I, J, K) mm, to the anterior and to the posterior leaflet, or to both if
+    #: they share one label
     distance: FloatArray
-    union: FloatArray
-    step: float
-    blur_mm: float
-    voxel_mm: float
+    union: FloatArray  #: (I, J, K) mm, to both leaflets together
+    step: float  #: mm between grid points
+    blur_mm: float  #: standard deviation of the smoothing of the distances
+    voxel_mm: float  #: size of the original voxels, 0 for surfaces
 
     def label(self, points: FloatArray) -> IntArray:
         """The nearer leaflet ``(k,)``, 0 anterior and 1 posterior, of points ``(k, 3)``.

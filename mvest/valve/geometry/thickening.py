@@ -89,25 +89,16 @@ def _across(normals: FloatArray, change: FloatArray) -> FloatArray:
 class ClosedSurface:
     """Outer surface of thickened leaflets, with outward normals.
 
-    Attributes
-    ----------
-    vertices : (n, 3) mm
-    triangles : (m, 3)
-    region : (m,)
-        Leaflet of each triangle.
-    kind : (m,)
-        Index into `FACE_KINDS`.
-
     Raises
     ------
     GeometryError
         The surface is not closed, manifold, outward and free of self-intersections.
     """
 
-    vertices: FloatArray
-    triangles: IntArray
-    region: IntArray
-    kind: IntArray
+    vertices: FloatArray  #: (n, 3) mm
+    triangles: IntArray  #: (m, 3)
+    region: IntArray  #: (m,), leaflet of each triangle
+    kind: IntArray  #: (m,), index into `FACE_KINDS`
 
     def __post_init__(self) -> None:
         check_surface(self.vertices, self.triangles, closed=True, name="closed surface")

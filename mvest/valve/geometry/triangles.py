@@ -126,23 +126,13 @@ MAX_TRIANGLES = 100_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """A finer surface.
+    """A finer surface."""
 
-    Attributes
-    ----------
-    weights : (r, n) sparse
-        Fine vertices from the coarse ones, which come first and stay.
-    triangles : (m, 3)
-    parent : (m,)
-        Coarse triangle that holds each fine one.
-    loops : tuple of (e,)
-        Refined closed loops along edges.
-    """
-
+    #: (r, n) sparse, fine vertices from the coarse ones, which come first and stay
     weights: sparse.csr_array
-    triangles: IntArray
-    parent: IntArray
-    loops: tuple[IntArray, ...]
+    triangles: IntArray  #: (m, 3)
+    parent: IntArray  #: (m,), coarse triangle that holds each fine one
+    loops: tuple[IntArray, ...]  #: tuple of (e,), refined closed loops along edges
 
 
 def refined(

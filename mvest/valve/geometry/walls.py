@@ -41,18 +41,11 @@ EDGE_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wall:
-    """One wall of a thick band: itself a band, with triangles facing out of the tissue.
+    """One wall of a thick band: itself a band, with triangles facing out of the tissue."""
 
-    Attributes
-    ----------
-    vertices : (n, 3) mm
-    triangles : (m, 3)
-    loops : two (k,) arrays
-        Its boundary; each loop has the same points in the same order in both walls.
-    """
-
-    vertices: FloatArray
-    triangles: IntArray
+    vertices: FloatArray  #: (n, 3) mm
+    triangles: IntArray  #: (m, 3)
+    #: two (k,) arrays, its boundary; each loop has the same points in the same order in both walls
     loops: tuple[IntArray, IntArray]
 
 

@@ -34,22 +34,6 @@ def jacobian_determinants(
 class SolidMesh:
     """A solid finite-element mesh of the leaflets.
 
-    Attributes
-    ----------
-    nodes : (n, 3) mm
-    elements : ndarray
-        ``(m, k)`` in the node order of :mod:`mvest.elements`.
-    element_type : str
-        Name of the element.
-    region : ndarray
-        ``(m,)`` index into ``region_names``.
-    region_names : tuple of str
-    fibre : ndarray
-        ``(m, k, 3)`` unit collagen directions at the nodes of each element: directions may jump
-        between leaflets. ``(n, 3)``, one direction per node, is accepted and expanded.
-    pressure_faces : ndarray
-        ``(f, kf)`` nodes of the ventricular faces, normals pointing out of the solid.
-
     Raises
     ------
     InputError, GeometryError
@@ -57,12 +41,15 @@ class SolidMesh:
         elements whose Jacobian determinant is not positive at a quadrature point.
     """
 
-    nodes: FloatArray
-    elements: IntArray
-    element_type: str
-    region: IntArray
+    nodes: FloatArray  #: (n, 3) mm
+    elements: IntArray  #: ``(m, k)`` in the node order of :mod:`mvest.elements`
+    element_type: str  #: name of the element
+    region: IntArray  #: ``(m,)`` index into ``region_names``
     region_names: tuple[str, ...]
+    #: ``(m, k, 3)`` unit collagen directions at the nodes of each element: directions may jump
+    #: between leaflets. ``(n, 3)``, one direction per node, is accepted and expanded.
     fibre: FloatArray
+    #: ``(f, kf)`` nodes of the ventricular faces, normals pointing out of the solid
     pressure_faces: IntArray
 
     def __post_init__(self) -> None:
@@ -126,21 +113,11 @@ LAST_STEP = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Embedding:
-    """Points as weighted sums of nodes.
+    """Points as weighted sums of nodes."""
 
-    Attributes
-    ----------
-    nodes : ndarray
-        ``(k, w)`` node indices; entries with weight zero are padding.
-    weights : ndarray
-        ``(k, w)``, each row sums to one.
-    host : ndarray
-        ``(k,)`` host element, or -1 for averages over several elements.
-    """
-
-    nodes: IntArray
-    weights: FloatArray
-    host: IntArray
+    nodes: IntArray  #: ``(k, w)`` node indices; entries with weight zero are padding
+    weights: FloatArray  #: ``(k, w)``, each row sums to one
+    host: IntArray  #: ``(k,)`` host element, or -1 for averages over several elements
 
     def __len__(self) -> int:
         return len(self.nodes)
