@@ -155,6 +155,7 @@ def model_of(
         units=about.units or None,
         points=None if about.points is None else _points(about.points, "points"),
         settings=settings,
+        inputs=source.inputs,
         differences=None if source.differences == "none" else Differences(*steps),
     )
 

@@ -28,6 +28,7 @@ SCHEMA = (
     "Schema/markups-schema-v1.0.3.json#"
 )
 TO_LPS = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
+FCSV_AXES = {"0": "RAS", "1": "LPS"}  # before Slicer 4.11
 MM_PER = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
 FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label"
 MAX_BYTES = 2**24
@@ -156,7 +157,8 @@ class _File(BaseModel):
 def _read_fcsv(source: Path) -> PointList:
     text = read_bytes(source, MAX_BYTES).decode("utf-8-sig", "replace")
     head = dict(re.findall(r"(?m)^#[ \t]*(\w+)[ \t]*=(.*)$", text))
-    if (axes := head.get("CoordinateSystem", "RAS").strip()) not in TO_LPS:
+    axes = head.get("CoordinateSystem", "RAS").strip()
+    if (axes := FCSV_AXES.get(axes, axes)) not in TO_LPS:
         raise InputError(f"{source}: CoordinateSystem: {one_line(axes, 40)}, expected LPS or RAS")
     columns = [name.strip() for name in head.get("columns", FCSV_COLUMNS).split(",")]
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]

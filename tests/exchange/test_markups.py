@@ -97,6 +97,10 @@ def test_fcsv_with_quotes_and_without_a_header(tmp_path: Path) -> None:
     assert found.labels == ("A, P", "AL")
     np.testing.assert_array_equal(found.points, TIPS.points * [-1, -1, 1])
 
+    for axes, sign in (("0", [-1, -1, 1]), ("1", [1, 1, 1])):  # before Slicer 4.11
+        (tmp_path / "F.fcsv").write_text(HEAD.format("4", axes) + COLUMNS + ROWS)
+        points = read_markups(tmp_path / "F.fcsv")["F"].points
+        np.testing.assert_array_equal(points, TIPS.points * sign)
     whole = HEAD.format("5", "LPS") + COLUMNS + ROWS
     for old, new, words in (
         ("= LPS", "= IJK", "CoordinateSystem"),

@@ -5,8 +5,8 @@ If the program gives no derivatives, they are differences of its predictions.
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
@@ -16,8 +16,16 @@ import numpy as np
 
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import Prediction
-from mvest.exchange.external.contract import Command, RunRequest, read_answer, write_request
-from mvest.files import require_writable
+from mvest.exchange.external.contract import (
+    RESPONSE,
+    Command,
+    RunRequest,
+    files_of_command,
+    read_answer,
+    write_request,
+)
+from mvest.files import require_writable, sha256_of
+from mvest.provenance import config_hash
 from mvest.reading.documents import validated
 from mvest.typing import FloatArray
 
@@ -62,7 +70,8 @@ class ProcessModel:
     """Coordinates ``(3 n,)`` mm that a program predicts for parameters ``(p,)``.
 
     This is an observation model for the filters: a run that fails is a failed prediction with a
-    reason. Each run has its own new folder below ``folder``.
+    reason. Each run has its own folder below ``folder``. Converged runs are reused, so that an
+    interrupted study goes on where it stopped.
 
     Parameters
     ----------
@@ -79,6 +88,9 @@ class ProcessModel:
         ``(n, 3)`` mm, reference positions of the observed points for the program.
     settings : mapping, optional
         Plain data for the program.
+    inputs : sequence of str
+        Files and folders on which the predictions depend, besides those that the command names. A
+        run is not reused if the content of any of them has changed.
     differences : Differences or None
         How to differentiate if the program does not; None requires derivatives of the program.
 
@@ -96,6 +108,7 @@ class ProcessModel:
     units: Sequence[str] | None = None
     points: FloatArray | None = None
     settings: Mapping[str, Any] | None = None
+    inputs: Sequence[str] = ()
     differences: Differences | None = Differences()
     runs: int = field(default=0, init=False)  #: number of runs that were started
     #: whether the program itself gave the last derivatives
@@ -157,31 +170,52 @@ class ProcessModel:
         }
         return validated(RunRequest, request, "request")
 
+    def _folder(self, request: RunRequest) -> Path:
+        """The folder of a run, named by everything that decides its result."""
+        points = None if self.points is None else self.points.tolist()
+        command = self.command
+        files = {str(path): path for path in map(Path, self.inputs)}
+        files |= files_of_command(command.arguments, command.environment)
+        content = {
+            "command": [command.arguments, command.environment],
+            "files": {name: sha256_of(path) for name, path in files.items()},
+            "points": points,
+            "request": request.model_dump(),
+        }
+        return self.folder / f"run-{config_hash(content)[:16]}"
+
     def _predictions(self, points: FloatArray, jacobian: bool) -> list[Prediction]:
         """Predictions at all points at the same time; an exception ends all programs."""
-        requests = [self._request(m, jacobian) for m in points]
         with ExitStack() as stack:
             started = []
-            for request in requests:
-                self.runs += 1
-                try:
-                    part = tempfile.mkdtemp(prefix=f"run-{self.runs:04d}-", dir=self.folder)
-                    write_request(folder := Path(part), request, self.points)
-                except (OSError, InputError) as error:
-                    return [Prediction.failed(str(error))] * len(points)
-                started.append((folder, stack.enter_context(self.command.started(folder))))
-            return [
-                _result(folder, request, ended())
-                for (folder, ended), request in zip(started, requests, strict=True)
-            ]
+            for request in [self._request(m, jacobian) for m in points]:
+                folder = self._folder(request)
+                ended: Callable[[], str] = str  # a finished run has no failure
+                if not (folder / RESPONSE).exists():
+                    self.runs += 1
+                    try:
+                        shutil.rmtree(folder, ignore_errors=True)  # an interrupted run
+                        folder.mkdir(parents=True)
+                        write_request(folder, request, self.points)
+                    except (OSError, InputError) as error:
+                        return [Prediction.failed(str(error))] * len(points)
+                    ended = stack.enter_context(self.command.started(folder))
+                started.append((folder, request, ended))
+            return [_result(folder, request, ended()) for folder, request, ended in started]
 
 
 def _result(folder: Path, request: RunRequest, failure: str) -> Prediction:
-    """The prediction of a run; ``failure`` is why the program failed, or empty."""
+    """The prediction of a run; ``failure`` is why the program failed, or empty.
+
+    A failed run loses its response, so that it is not reused.
+    """
     try:
         answer = read_answer(folder, request)
     except InputError as error:
         answer = Prediction.failed(str(error))
     if not answer.converged and not (failure and "missing" in answer.reason):
         failure = "; ".join(filter(None, [failure, answer.reason]))
-    return Prediction.failed(f"{folder.name}: {failure}") if failure else answer
+    if not failure:
+        return answer
+    (folder / RESPONSE).unlink(missing_ok=True)
+    return Prediction.failed(f"{folder.name}: {failure}")

@@ -59,6 +59,13 @@ def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
     rows = record.table_of().rows
     assert [row["unit"] for row in rows] == ["N/mm", "N/mm"]
     assert rows[0]["runs"] == 5 * record.forward_solves
+    # The same study again starts no program, until the program changes.
+    assert run()[0] == 0
+    assert read_record(tmp_path / "here" / "result.json").table_of().rows[0]["runs"] == 0
+    with (tmp_path / "solve.py").open("a") as program:
+        program.write("# changed\n")
+    assert run()[0] == 0
+    assert read_record(tmp_path / "here" / "result.json").table_of().rows[0]["runs"] > 0
 
 
 def test_check_runs_the_program_once_and_compares_its_derivatives(run, tmp_path):
