@@ -121,6 +121,7 @@ class MadeUpClosure:
     mesh = MESH
     settings = MECHANICS
     closed = None
+    contact_reach_mm = 1.5
 
     def restart(self, closed: Any) -> None:
         """Nothing is remembered."""

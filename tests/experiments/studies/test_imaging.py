@@ -25,7 +25,7 @@ STUDY = (
     "imaging=small",
     "tracking.enabled=false",
     # Two frames, and half the voxels in the same field of view.
-    "imaging.population.motion.frames=2",
+    "imaging.motion.frames=2",
     "imaging.training.acquisition.voxel_mm=2.5",
     "imaging.training.acquisition.shape=[40,32,40]",
 )
