@@ -69,7 +69,8 @@ class Acquisition:
     blood_attenuation_db_per_cm_mhz: Decibel = 0.15  #: one way (Duck 1990: 0.15 to 0.2)
     compensation_db_per_cm_mhz: Decibel = 0.17  #: one way; it also amplifies electronic noise
     shadow_db_per_cm: Decibel = 20.0  #: one way, added in dense tissue (parts of the annulus)
-    angle_exponent: Factor = 1.5  #: walls and leaflets send floor + (1 - floor) |n . beam|^exponent
+    #: walls and leaflets send ``floor + (1 - floor) |n . beam|^exponent``
+    angle_exponent: Factor = 1.5
     angle_floor_db: Decibel = -22.0
     dropout: Share = 0.1  #: share of the leaflets in patches with hardly any echo, 0 to 0.6
     dropout_db: Decibel = -20.0  #: level of that echo relative to the leaflets' own
