@@ -111,13 +111,16 @@ def test_a_saddle_prolapses_over_its_plane_but_does_not_billow(quick):
     assert found["billow_height_mm"] == pytest.approx(0.0, abs=0.05)
 
 
-def test_ratios_and_tips(quick):
+def test_ratios_lengths_and_tips(quick):
     p = TemplateParameters(AnnulusDimensions(anterior_flattening=0.0))
     found = measured(p)
     assert found["annulus_sphericity_ratio"] == pytest.approx(
         p.annulus.anteroposterior_half_axis / p.annulus.commissural_half_axis, 0.02
     )
     assert found["tip_separation_mm"] == pytest.approx(2 * p.papillary.tip[0])
+    # The longest way from annulus to edge, in the middle of each leaflet.
+    assert found["anterior_length_mm"] == pytest.approx(p.leaflets.anterior.length, rel=0.1)
+    assert found["posterior_length_mm"] == pytest.approx(p.leaflets.posterior.length, rel=0.1)
     vertices, surface, annulus = dome(-6.0)
     found = clinical_measurements(
         vertices, surface, annulus, TIPS, 1.0, tip_names=("tip_0", "tip_180")
