@@ -14,7 +14,6 @@ import mvest.closure.model
 from mvest.closure.continuation import ClosedState
 from mvest.closure.model import REST, ClosureModel
 from mvest.errors import InputError
-from mvest.mechanics import valve_system
 from mvest.mechanics.settings import (
     ClosureProtocol,
     MechanicsSettings,
@@ -23,7 +22,6 @@ from mvest.mechanics.settings import (
 from mvest.mechanics.steps import NewtonSettings, StepReason
 from mvest.mechanics.valve_system import HeldState, boundary_loading, build_system
 from mvest.valve.anatomy.template import Template
-from mvest.valve.mesh.solid_mesh import embed
 from mvest.valve.mesh.structured import structured_mesh
 
 MODULI = ("E_f.anterior", "E_f.posterior")
@@ -223,7 +221,6 @@ def test_a_restarted_guide_forgets_too():
 @pytest.mark.parametrize(
     ("reach", "m", "frames"),
     [
-        (np.inf, 3.0 * AT, 2),
         (0.2, 1.2 * AT, 2),
         (0.2, 1.3 * AT, 4),
         (0.0, AT, 2),
@@ -361,21 +358,6 @@ def test_loads_do_not_depend_on_the_mesh():
         one, two = (embedded(system)(system.solid.mesh.nodes) for system in (first, other))
         np.testing.assert_allclose(two, one, atol=1e-6, err_msg=part)
     np.testing.assert_array_equal(other.hinge.stiffness, first.hinge.stiffness)
-
-
-def test_a_chord_is_spread_over_its_patch():
-    valve, contact_valve = TEMPLATE.valve(16, 5), TEMPLATE.valve(96, 32)
-    mesh = structured_mesh(TEMPLATE, "hex18", 24, 3)
-    points = embed(mesh, contact_valve.surface.vertices)
-    insertion = valve.chordae.insertion
-
-    for radius in (1.0, 2.0):
-        members, weights, _ = valve_system.patch_members(contact_valve, radius, insertion)
-        patches = points.average(weights, members)
-        np.testing.assert_allclose(patches.weights.sum(axis=1), 1, atol=1e-12)
-        # The centre of a patch lies within it; at the free edge it is cut on one side.
-        distance = np.linalg.norm(patches(mesh.nodes) - insertion, axis=1)
-        assert distance.max() < 0.5 * radius
 
 
 def test_the_protocol_ramps_in_equal_steps_then_grows_to_the_end_and_to_equilibrium():

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.closure.continuation import STIFFENED, ClosedState, Coordinates
 from mvest.errors import InputError
 from mvest.mechanics.law import Points
 from mvest.mechanics.law.biot import BiotLaw
@@ -165,19 +164,6 @@ def test_parameters_go_before_settings_and_one_law_for_all_is_not_divided():
 def test_parameters_of_the_other_law_are_refused_before_anything_is_closed(names, message):
     with pytest.raises(InputError, match=message):
         with_tissue(EXPONENTIAL, OPEN, names, **TINY).close(np.ones(len(names)))
-
-
-def test_a_way_begins_without_any_stiffening():
-    coordinates = Coordinates.of(STIFF_NAMES, with_tissue(STIFFENING, OPEN, **TINY).settings)
-    none = np.array([6.23, 2.09, 0.0])
-    np.testing.assert_allclose(coordinates(none), [np.log(6.23), np.log(2.09), 0.0])
-    at = coordinates(STIFF_AT)
-    np.testing.assert_allclose(coordinates.parameters(at), STIFF_AT, rtol=1e-14)
-    assert at[2] == pytest.approx(STIFFENED * np.log(1.5))
-    state = ClosedState(STIFF_AT, None, slopes=np.eye(3))
-    move = coordinates.expected_move(state, 1.001 * STIFF_AT)
-    np.testing.assert_allclose(move, 0.001 * STIFF_AT, rtol=1e-3)
-    assert coordinates.distance(STIFF_AT, np.array([6.23, 2.09, -1.5])) == np.inf
 
 
 def test_a_closure_begins_with_linear_tissue_and_ends_where_any_other_does():

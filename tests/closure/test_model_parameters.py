@@ -3,8 +3,6 @@
 On the same small valve as in test_model.py.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -112,18 +110,6 @@ def test_factors_of_all_chordae_and_of_some_multiply():
     apart = frame(chord_rest_length_of_tip0=0.97 * 0.98, chord_rest_length_of_tip1=0.97)
     np.testing.assert_allclose(product, apart, rtol=0, atol=1e-9)
     assert np.abs(product - both).max() > 0.01
-
-
-def test_a_fixed_damping_replaces_that_of_the_settings():
-    damping = model_of(OPEN).settings.damping
-    given = model_of(OPEN, **TINY, settings={"damping": replace(damping, beta=0.05)})
-    fixed = model_of(OPEN, **TINY, fixed={"damping": 0.05})
-    usual = model_of(OPEN, **TINY)
-    one, two, other = (
-        m.close(AT, sensitivities=False).simulation.frames[-1] for m in (given, fixed, usual)
-    )
-    np.testing.assert_array_equal(one, two)
-    assert np.abs(one - other).max() > 0.01
 
 
 @pytest.mark.parametrize(

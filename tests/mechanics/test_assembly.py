@@ -6,7 +6,6 @@ from scipy import sparse
 from mvest.mechanics.assembly import (
     SparsityPattern,
     adjacency,
-    elements_of_nodes,
     scatter_blocks,
 )
 from mvest.mechanics.body import outer_faces
@@ -25,46 +24,6 @@ def test_a_matrix_by_halves_is_the_matrix():
     x = random.normal(size=(30, 2))
     np.testing.assert_allclose(matrix @ x, dense @ x, atol=1e-14)
     np.testing.assert_allclose(matrix @ x[:, 0], dense @ x[:, 0], atol=1e-14)
-
-
-def test_coupled_elements_couple_all_their_nodes():
-    mesh = block("hex18", (4, 3, 1))
-    elements, n = mesh.elements, len(mesh.nodes)
-    pairs = np.array([[0, 11], [0, 7], [3, 3], [3, 4], [5, 10]])
-    static = SparsityPattern.of(adjacency(n, [elements]), NO_PAIRS)
-    pattern = static.with_coupling(elements, pairs, elements_of_nodes(n, elements))
-    expected = adjacency(n, [elements]).toarray() != 0
-    for one, other in pairs:
-        expected[np.ix_(elements[one], elements[other])] = True
-        expected[np.ix_(elements[other], elements[one])] = True
-    rows, columns = np.nonzero(np.triu(expected))
-    np.testing.assert_array_equal(pattern.rows, rows)
-    np.testing.assert_array_equal(pattern.columns, columns)
-    assert static.with_coupling(elements, pairs[:0], elements_of_nodes(n, elements)) is static
-
-
-def test_positions_are_those_of_the_nodes():
-    mesh = block("hex18", (4, 3, 1))
-    elements, n = mesh.elements, len(mesh.nodes)
-    pairs = np.array([[0, 11], [4, 5]])
-    pattern = SparsityPattern.of(adjacency(n, [elements]), NO_PAIRS).with_coupling(
-        elements, pairs, elements_of_nodes(n, elements)
-    )
-    within = pattern.within(elements)
-    row, column = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])
-    upper = row <= column
-    assert np.all(within[~upper] == -1)
-    np.testing.assert_array_equal(pattern.rows[within[upper]], row[upper])
-    np.testing.assert_array_equal(pattern.columns[within[upper]], column[upper])
-    first, second = elements[pairs[:, 0]], elements[pairs[:, 1]]
-    between = pattern.between(first, second)
-    row, column = np.broadcast_arrays(first[:, :, None], second[:, None, :])
-    same = row == column
-    assert np.count_nonzero(same) > 3  # neighbours have nodes in common
-    np.testing.assert_array_equal(between < 0, same)
-    at = np.where(same, -1 - between, between)
-    np.testing.assert_array_equal(pattern.rows[at], np.minimum(row, column))
-    np.testing.assert_array_equal(pattern.columns[at], np.maximum(row, column))
 
 
 def test_points_that_share_a_node_add_up():

@@ -20,7 +20,6 @@ from mvest.mechanics import (
 )
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
-from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from tests.mechanics.bodies import MATERIALS, block, sandwich
 
@@ -64,37 +63,6 @@ def test_newton_converges_quadratically(element_type, static):
     assert result.converged
     assert all(len(record.residuals) <= 7 for record in result.records)
     assert sum(assert_quadratic(record.residuals) for record in result.records) >= 2
-
-
-def strip(element_type, length, steps, *, load=4.0, newton=None):
-    """A cantilever 0.1 mm thick and 1 mm wide under a shear force at its end, in static steps."""
-    mesh = block(element_type, (int(length), 1, 1), (length, 1.0, 0.1))
-    nodes = mesh.nodes
-    law = BiotLaw.of((TransverselyIsotropic.isotropic(1.2e6, 0.0),))
-    system = System(Solid(mesh, law), fixed_nodes=np.flatnonzero(nodes[:, 0] == 0))
-    tip = nodes[:, 0] == length
-    push = np.zeros_like(nodes)
-    push[tip, 2] = load / np.count_nonzero(tip)
-    held = nodes[system.fixed_nodes]
-    times = np.linspace(0, 1, steps + 1)[1:]
-    result = simulate(
-        system,
-        lambda t: Loads(fixed=held, body_force=t * push),
-        [Step(t, static=True) for t in times],
-        newton=newton,
-    )
-    assert result.converged
-    return result, (result.frames[-1] - nodes)[tip].mean(axis=0)
-
-
-def test_a_static_step_that_is_too_long_is_halved():
-    whole, expected = strip("hex18", 10.0, 1)
-    assert [record.halvings for record in whole.records] == [0]
-    parts, tip = strip("hex18", 10.0, 1, newton=NewtonSettings(max_iterations=12))
-    assert len(parts.records) > 1
-    assert max(record.halvings for record in parts.records) >= 1
-    assert parts.records[-1].time == 1
-    np.testing.assert_allclose(tip, expected, atol=1e-8)
 
 
 def test_newton_converges_quadratically_with_contact():

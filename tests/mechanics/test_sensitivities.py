@@ -76,17 +76,9 @@ def test_sensitivities_agree_with_central_differences(reference, name):
     assert (np.linalg.norm(best - exact, axis=(1, 2)) / size).max() < 1e-6
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("E_f.middle", "unknown region.*lower, upper"),
-        ("viscosity", "known: E_f.REGION, field.REGION.K"),
-        ("chord_stiffness.strut", "no chordae 'strut'; known .*left, right, tip0, tip1"),
-    ],
-)
-def test_an_unknown_parameter_names_the_known_ones(name, message):
-    with pytest.raises(InputError, match=message):
-        run(TRUE.values(), [Parameter(name, 1.0)], contact=False)
+def test_an_unknown_region_is_told_the_known_ones():
+    with pytest.raises(InputError, match=r"unknown region.*lower, upper"):
+        run(TRUE.values(), [Parameter("E_f.middle", 1.0)], contact=False)
 
 
 def test_derivatives_of_the_last_frame_alone_are_the_same(reference):
@@ -105,15 +97,3 @@ def test_derivatives_of_the_last_frame_alone_are_the_same(reference):
     size = np.abs(reference.sensitivities[-1]).max(axis=(1, 2), keepdims=True)
     difference = result.sensitivities[-1] - reference.sensitivities[-1]
     assert np.abs(difference / size).max() < 1e-7
-
-
-def test_a_system_given_other_moduli_and_factors_is_the_system_made_with_them():
-    other = {**TRUE, "E_f.upper": 0.8, "pressure_scale": 0.9, "chord_rest_length": 0.99}
-    fresh = run(other.values())
-    used, loading = system_of(TRUE.values())
-    first = simulate(used, loading, STEPS[:2], newton=NEWTON)
-    assert first.converged
-    wanted, _ = system_of(other.values())
-    used.retune(wanted.solid.law, wanted.factors)
-    again = simulate(used, loading, STEPS, newton=NEWTON)
-    np.testing.assert_allclose(again.frames, fresh.frames, atol=1e-9)

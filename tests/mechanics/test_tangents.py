@@ -10,12 +10,10 @@ import pytest
 
 from mvest.mechanics.assembly import SparsityPattern, add_forces, adjacency
 from mvest.mechanics.body import outer_faces
-from mvest.mechanics.forces.cables import Cables
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Loads, System
-from mvest.valve.mesh.solid_mesh import embed
 from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, SIDE, block, sandwich
 
 STEPS = (2e-3, 1e-3, 1e-5)
@@ -105,28 +103,6 @@ def test_follower_load_pushes_against_the_normal_and_sums_to_pressure_times_area
     top = mesh.pressure_faces[np.all(mesh.nodes[mesh.pressure_faces][:, :, 2] > 1.9, axis=1)]
     force = PressureLoad(top, "quad9").forces(mesh.nodes).sum(axis=(0, 1))
     np.testing.assert_allclose(force, [0, 0, -12.0], atol=1e-12)
-
-
-def soft_block():
-    mesh = block("hex18", (2, 2, 1))
-    law = BiotLaw(np.zeros((1, 6, 6)))  # no stiffness of its own: only what is attached acts
-    return mesh, Solid(mesh, law, enhanced=False)
-
-
-@pytest.mark.parametrize("rest", [(3.0, 3.0), (7.0, 7.8)], ids=["taut", "slack and within the toe"])
-def test_chords(rest):
-    mesh, solid = soft_block()
-    ends = embed(mesh, np.array([[1.0, 1.0, 1.0], [3.0, 2.0, 1.0]]))
-    tips = np.array([[1.0, 0.0, 9.0], [4.0, 2.0, 8.0]])
-    cables = Cables(ends, np.array([0, 1]), np.array(rest), np.array([16.0, 9.0]), 0.1)
-    system = System(solid, cables=cables)
-    x = moved(mesh)
-    if rest[0] == 7.0:
-        strain = cables.strain(x, tips)
-        assert np.any((strain > 0) & (strain < 0.1)) or np.any(strain < 0)
-    if np.all(cables.strain(x, tips) <= 0):
-        pytest.fail("both cables slack: nothing is tested")
-    check_system(system, x, Loads(tips=tips))
 
 
 def pressed(system, loading, seed=3):

@@ -6,14 +6,10 @@ import pytest
 
 from tests.mechanics.bodies import SaintVenantKirchhoff
 from tests.verification.febio import (
-    GAP_MM,
-    REACH_MM,
     RESULTS,
     block,
     here,
     largest,
-    valve_model,
-    with_febios_element,
 )
 from tests.verification.strip import MATERIALS
 
@@ -51,13 +47,3 @@ def test_the_stored_body_comes_out_again_here():
     own = here(mesh, held, 4.1e-3, MATERIALS["A"]).frames[-1]
     assert largest(own - mesh.nodes) == pytest.approx(row.here_mm, rel=1e-5)
     assert largest(law - own) == pytest.approx(row.by_law_mm, rel=1e-5)
-
-
-def test_what_is_exchanged_here_is_febios():
-    contact = valve_model("potential", alike=True).settings.contact
-    thickness = valve_model("potential").contact_valve.surface.thickness.mean()
-    assert (contact.reference_distance - 1) * thickness == pytest.approx(GAP_MM)
-    assert (contact.activation_distance - 1) * thickness == pytest.approx(REACH_MM)
-    mesh = with_febios_element(valve_model("none")).mesh
-    assert mesh.element_type == "hex27"
-    np.testing.assert_array_equal(mesh.fibre, np.broadcast_to(mesh.fibre[:, :1], mesh.fibre.shape))

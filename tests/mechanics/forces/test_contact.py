@@ -57,7 +57,6 @@ def pair(distance):
     return contact, contact.search(y), y
 
 
-# -- the law ---------------------------------------------------------------------------------------
 def pressure_between_sheets(distance, spacing):
     """Force per area on a point above a large regular sheet of points, at an arbitrary offset."""
     n = int(np.ceil((H + 0.5) / spacing))
@@ -87,7 +86,6 @@ def test_points_press_like_parallel_sheets(distance):
     assert np.polyfit(np.log(spacings), np.log(errors), 1)[0] > 3
 
 
-# -- smoothness ------------------------------------------------------------------------------------
 def test_force_vanishes_with_the_third_order_at_activation():
     # phi = p / (2 pi r) with p ~ (h - r)^4, so phi' ~ (h - r)^3: the force and its first two
     # derivatives are continuous at activation (C3 in the energy). Order by a log-log fit.
@@ -98,7 +96,6 @@ def test_force_vanishes_with_the_third_order_at_activation():
     assert np.all(contact.forces(pairs, y) == 0)
 
 
-# -- forces ----------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def cloud():
     """Two rough sheets of points in contact, each point its own host."""
@@ -134,10 +131,6 @@ def test_action_equals_reaction(cloud):
     np.testing.assert_allclose(np.cross(y, force).sum(axis=0), 0, atol=1e-14)
 
 
-# -- the stress-free state -------------------------------------------------------------------------
-
-
-# -- search and passing ----------------------------------------------------------------------------
 def test_the_search_finds_all_pairs_that_can_become_active_before_it_is_stale():
     random = np.random.default_rng(8)
     y = random.uniform(0, 6, (150, 3))
@@ -204,7 +197,6 @@ def test_a_step_takes_from_a_pair_at_most_its_share_of_the_way_to_the_barrier():
     assert contact.largest_step(pairs, y, -dy) == 1.0
 
 
-# -- proofs in place of collision detection --------------------------------------------------------
 def two_sheets(gap, spacing=0.7, points=9):
     """Two flat sheets that were far apart at rest, with what lies between them."""
     line = spacing * np.arange(points)

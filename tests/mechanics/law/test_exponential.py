@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 
 from mvest.errors import MaterialError
 from mvest.mechanics.law import Points
@@ -13,8 +12,6 @@ from mvest.mechanics.law.exponential import MAX_EXPONENT, ExponentialLaw, biaxia
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue
-from mvest.mechanics.solid import Solid
-from tests.mechanics.bodies import block
 
 TISSUES = (ExponentialTissue(0.06, 4.3, 900.0), ExponentialTissue(0.04, 4.8, 305.0, kappa=2.0))
 LAW = ExponentialLaw.of(TISSUES)
@@ -46,7 +43,6 @@ def fourth_order(function, h):
     return (16 * fine - coarse) / 15
 
 
-# -- derivatives -----------------------------------------------------------------------------------
 def test_stress_is_the_derivative_of_the_energy_and_the_tangent_that_of_the_stress():
     # Fibres in tension and in compression, and shear of every kind, are among the strains.
     assert GREEN[..., 0].min() < -0.05 < 0.05 < GREEN[..., 0].max()
@@ -103,7 +99,6 @@ def by_parameter(name, which):
     )
 
 
-# -- limits ----------------------------------------------------------------------------------------
 def test_at_rest_there_is_no_stress_and_the_stiffness_of_ground_and_penalty():
     # The exponential starts with the fourth power of the strain, so that mu and kappa alone are
     # left: lambda = kappa - 2 mu / 3, as in isotropic elasticity.
@@ -145,7 +140,6 @@ def test_inadmissible_coefficients_are_rejected_with_their_values(change, messag
         replace(TISSUES[0], **change)
 
 
-# -- curves ----------------------------------------------------------------------------------------
 def incompressible(tissue, stretches):
     """Nominal stresses of a sheet of constant volume.
 
@@ -191,43 +185,3 @@ def test_biaxial_stress_of_the_linear_law():
     stretches = np.array([[1.05, 1.02], [0.98, 1.1]])
     found = biaxial_stress(BiotLaw.of((material,)), stretches)
     np.testing.assert_allclose(found, (stretches - 1) @ plane, rtol=1e-9)
-
-
-# -- in a body -------------------------------------------------------------------------------------
-@pytest.mark.parametrize("element_type", ["hex18"])
-def test_a_stretched_block_bears_the_biaxial_stress(element_type):
-    # The block is stretched as a whole, in its fibre frame. On a distorted mesh inner nodes must
-    # be in equilibrium, the faces across the thickness free, and those across the two stretches
-    # bear nominal stress times area.
-    size, stretches = np.array([4.0, 3.0, 2.0]), np.array([1.1, 1.08])
-    mesh = block(element_type, (2, 2, 1), tuple(size), distortion=(0.2, 0.2, 0))
-    law = ExponentialLaw.of(TISSUES[:1])
-    expected = biaxial_stress(law, stretches[None])[0]
-    thickness = thickness_of(law, stretches)
-    solid = Solid(mesh, law)
-    x = mesh.nodes * np.array([*stretches, thickness])
-    state = solid.evaluate(x, solid.initial_strain(), 0.0)
-    forces = np.zeros_like(x)
-    np.add.at(forces, mesh.elements, solid.forces(state))
-    at = [mesh.nodes[:, axis] > size[axis] - 1e-9 for axis in range(3)]
-    scale = expected[0] * size[1] * size[2]
-    assert forces[at[0], 0].sum() == pytest.approx(expected[0] * size[1] * size[2], rel=1e-9)
-    assert forces[at[1], 1].sum() == pytest.approx(expected[1] * size[0] * size[2], rel=1e-9)
-    assert abs(forces[at[2], 2].sum()) < 1e-9 * scale
-    sides = np.zeros(len(x), dtype=bool)
-    for axis in (0, 1):
-        sides |= at[axis] | (mesh.nodes[:, axis] < 1e-9)
-    assert np.abs(forces[~sides]).max() < 1e-9 * scale
-
-
-def thickness_of(law, stretches):
-    """Stretch of the thickness at which S33 vanishes, by bisection."""
-
-    def across(thickness):
-        green = np.zeros((1, 1, 6))
-        green[0, 0, :3] = 0.5 * (np.array([*stretches, thickness]) ** 2 - 1)
-        return float(
-            law.response(Points(green, np.zeros(1, int), np.zeros_like(green), 0.0))[0][0, 0, 2]
-        )
-
-    return brentq(across, 0.5, 1.2, xtol=1e-15)

@@ -18,7 +18,6 @@ READING_A, READING_C = PoissonReading.LITERAL, PoissonReading.NEARLY_INCOMPRESSI
 ANTERIOR, POSTERIOR = (6.23, 2.35, 2.09), (2.09, 1.89, 0.70)
 
 
-# -- admissibility ---------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("E_f", "ratio", "reading", "bulk"),
     [
@@ -49,7 +48,6 @@ def test_inadmissible_moduli_are_rejected_with_their_values(change, message):
         TransverselyIsotropic(**values)
 
 
-# -- the moduli come back --------------------------------------------------------------------------
 def stretched(mesh, material, stress, expected):
     """Deformation gradient of a body under the nominal stress P ``(3, 3)`` on its whole surface.
 
@@ -149,7 +147,6 @@ def test_shear_recovers_G(element_type, plane):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.05)
 
 
-# -- energy, stress, tangent of the law itself -----------------------------------------------------
 def energy(law, green):
     e = law.strain(green)
     return 0.5 * np.einsum("eqi,ij,eqj->eq", e, law.stiffness[0], e)

@@ -34,17 +34,6 @@ def middle(valve: Valve, solid: ClosedSurface) -> Midsurface:
     return midsurface(solid.vertices, solid.triangles, tips=valve.papillary_tips)
 
 
-def test_walls_are_the_faces_that_were_thickened(solid: ClosedSurface) -> None:
-    parts = walls(*closed_band(solid.vertices, solid.triangles))
-    faces = [solid.triangles[solid.kind == kind] for kind in (0, 1)]
-    corners = [solid.vertices[face].mean(axis=1) for face in faces]
-    for part in parts:
-        own = [closest_points(c, part.vertices, part.triangles).distance for c in corners]
-        shares = [float((distance < 1e-9).mean()) for distance in own]
-        # All triangles of one face, none of the other.
-        assert sorted(shares) == pytest.approx([0.0, 1.0], abs=0.01)
-
-
 def test_midsurface_is_that_which_was_thickened(valve: Valve, middle: Midsurface) -> None:
     surface = valve.surface
     nearest = closest_points(middle.vertices, surface.vertices, surface.triangles)

@@ -3,7 +3,7 @@ import pytest
 
 from mvest.errors import GeometryError
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus
-from mvest.valve.measure.clinical import closure, leaflet_length, tenting
+from mvest.valve.measure.clinical import leaflet_length, tenting
 from mvest.valve.measure.coaptation import coaptation_area, coaptation_length, orifice_area
 
 BELOW = np.array([0.0, 0.0, 30.0])
@@ -94,32 +94,6 @@ def test_coaptation_of_a_wedge(shapes):
     assert coaptation_area(vertices, a, b, 1.3, subdivisions=6) == pytest.approx(
         12 * 1.3 / np.sin(2 * alpha), rel=0.03
     )
-
-
-def test_closure_of_a_slit_valve(shapes):
-    """Two leaves bend down from a square annulus and hang 1.3 mm apart, 8 mm deep."""
-    half, depth, gap = 10.0, 8.0, 1.3
-    roof_a = shapes.plate([gap / 2, -half, 0], [half - gap / 2, 0, 0], [0, 2 * half, 0], 20)
-    wall_a = shapes.plate([gap / 2, -half, 0], [0, 2 * half, 0], [0, 0, depth], 20)
-    roof_p = shapes.plate([-half, -half, 0], [half - gap / 2, 0, 0], [0, 2 * half, 0], 20)
-    wall_p = shapes.plate([-gap / 2, -half, 0], [0, 0, depth], [0, 2 * half, 0], 20)
-    vertices, triangles, parts = shapes.join(roof_a, wall_a, roof_p, wall_p)
-    region = np.repeat([0, 0, 1, 1], [len(part) for part in parts])
-    vertices, number = np.unique(vertices.round(9), axis=0, return_inverse=True)
-    triangles = number.ravel()[triangles]  # roof and wall share the vertices of their edge
-    side = np.linspace(-half, half, 41)[:-1]
-    annulus = np.array(
-        [(x, -half, 0.0) for x in side]
-        + [(half, y, 0.0) for y in side]
-        + [(-x, half, 0.0) for x in side]
-        + [(-half, -y, 0.0) for y in side]
-    )
-    pair = [triangles[region == k] for k in (0, 1)]
-    found = closure(vertices, triangles, annulus, plane_of(annulus), pair, 1.4)
-    assert found["coaptation_length_mm"] == pytest.approx(8.0, abs=0.05)
-    # Beside the walls, 2 x 8 x 20, nothing of the roofs faces the other leaflet.
-    assert found["coaptation_area_mm2"] == pytest.approx(8.0 * 20, rel=0.02)
-    assert found["orifice_mm2"] == pytest.approx(gap * 20, rel=0.1)
 
 
 @pytest.mark.parametrize(
