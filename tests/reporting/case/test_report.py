@@ -112,18 +112,6 @@ def test_the_page_loads_nothing_and_is_not_too_large(written, html) -> None:
     assert (values["name"], float(values["estimate"])) == ("E_f.anterior", 5.8)
 
 
-def test_the_scene_shows_one_state_at_a_time(html) -> None:
-    shown = re.findall(r'data-shown="([^"]*)">([^<]*)<', html)
-    assert [label for _, label in shown] == [
-        "open", "closed, observed", "closed, generic", "closed, personalised",
-        "observed (grey) over personalised",
-    ]  # fmt: skip
-    visible = np.array([[word == "true" for word in re.findall(r"\w+", v)] for v, _ in shown])
-    # Every trace belongs to exactly one state.
-    assert (visible.sum(axis=0) == 1).all()
-    assert visible.any(axis=1).all()
-
-
 def test_an_almost_empty_record_has_a_page(case, tmp_path) -> None:
     with np.load(case[1]) as stored:
         kept = ("triangles", "region", "rest", "annulus", "frames", "seen")
