@@ -82,9 +82,6 @@ def test_iterated_mode_ends_at_the_posterior_mode():
     np.testing.assert_allclose(estimate.prediction.y, estimate.mean**2, rtol=1e-15)
 
 
-# --- Counting, stopping, reporting ---------------------------------------------------------------
-
-
 # --- Step control --------------------------------------------------------------------------------
 
 

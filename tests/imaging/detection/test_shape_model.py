@@ -238,12 +238,3 @@ def test_misses_have_the_requested_deviations(shape):
     expected = [2.0] * 3 + [np.deg2rad(10.0)] * 3 + [0.05]
     np.testing.assert_allclose(by.std(axis=0), expected, rtol=0.05)
     np.testing.assert_allclose(by.mean(axis=0) / expected, 0, atol=0.06)
-
-
-def test_world_is_scaled_then_turned_then_moved():
-    # Axes in rows instead of columns, or a scale that moves the centre, fail here.
-    some = poses(5)
-    p = np.array([1.0, -2.0, 3.0])
-    for k in range(5):
-        expected = some.centre[k] + np.exp(some.log_scale[k]) * (some.rotation[k] @ p)
-        np.testing.assert_allclose(some.world(p[None])[k, 0], expected, atol=1e-12)
