@@ -54,21 +54,13 @@ BAD = [
     (lambda: normal(np.diag([1.0, -0.5])), "negative variance -0.5 in row 1"),
     (lambda: normal([[1.0, 0.2], [0.1, 1.0]]), r"\(0, 1\) is 0.2 and entry \(1, 0\) is 0.1"),
     (lambda: normal([[1.0, 2.0], [2.0, 1.0]]), "semi-definite; the smallest eigenvalue.*-1"),
-    (lambda: Gaussian.from_variance(np.zeros(2), np.ones(3)), r"have shape \(2, 2\); got \(3,\)"),
     (lambda: noise(np.ones(4), 3), "the 3 variances.*\\(4,\\)"),
     (lambda: noise([1.0, -2.0]), "variance in R is -2"),
-    (lambda: noise([[1.0, 2.0], [2.0, 1.0]]), "positive definite"),
     (lambda: prediction(PATH, [[1.0], [0.0]]), r"\(n, p\); got \(3,\) and \(2, 1\)"),
     (lambda: prediction([0.0, np.nan], [[0.0], [0.0]]), "y must be finite; entry 1 is nan"),
     (lambda: Prediction.failed(" "), "must say why"),
-    (lambda: run(y=[1.0, np.nan, 2.0]), "y must be finite; entry 1"),
     (lambda: run(y=[1.0, 2.0]), r"must predict 2 observations.*y of shape \(3,\)"),
-    (
-        lambda: run(prior=normal(np.eye(1), (0.0,)), model=lambda m: model([1, 2])),
-        r"1 parameters; got y of shape \(3,\) and jacobian of shape \(3, 2\)",
-    ),
     (lambda: run(names=["E", "E"]), "different names"),
-    (lambda: run(PaperFilter(Q=np.ones(3))), r"Q must have shape \(2, 2\); got \(3,\)"),
     (lambda: IteratedFilter(objective_tolerance=-1.0), "filter objective_tolerance = -1.0"),
     (lambda: PaperFilter(max_iterations=0), "max_iterations = 0, expected >= 1"),
     (lambda: run(IteratedFilter(start=(1.0, 4.0)), prior=HALF_FIXED), "holds fixed"),
@@ -77,7 +69,6 @@ BAD = [
     (lambda: run().interval(1.0), "between 0 and 1; got 1"),
     (lambda: nees(np.zeros(2), np.diag([1.0, 0.0])), "positive definite"),
     (lambda: moran(PATH, sparse.eye_array(3)), "zero diagonal"),
-    (lambda: moran(PATH, sparse.csr_array((3, 3))), "one pair"),
     (lambda: bound(np.array([[np.nan]]), 1.0), r"Jacobian must be finite; entry \(0, 0\)"),
     (lambda: scaled([1.0, 0.0]), "scale must be 2 positive numbers"),
     (lambda: bound(ONES, 1.0, HALF_FIXED), "positive definite here"),
@@ -88,17 +79,6 @@ BAD = [
 def test_bad_input_is_one_clear_error(make, message):
     with pytest.raises(InputError, match=f"(?s){message}"):
         make()
-
-
-def test_value_objects_cannot_be_changed():
-    mean = np.array([1.0, 2.0])
-    prior = Gaussian(mean, np.eye(2))
-    mean[0] = 99.0
-    assert prior.mean[0] == 1.0
-    with pytest.raises(ValueError, match="read-only"):
-        prior.covariance[0, 0] = 2.0
-    with pytest.raises(AttributeError):
-        prior.mean = mean
 
 
 def test_round_off_in_a_covariance_is_accepted():

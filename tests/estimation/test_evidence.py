@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
 from mvest.errors import InputError
-from mvest.estimation import Gaussian, IteratedFilter, Prediction, kalman_update
+from mvest.estimation import Gaussian, kalman_update
 from mvest.estimation.evidence import Evidence, LearnedNoise
 from mvest.estimation.noise import ErrorColumns, NoiseBlock, NoiseFamily, kronecker_noise
 from mvest.estimation.spectrum import BANDS, LogNormal, Spectrum, matern, smooth_basis
@@ -60,7 +60,6 @@ def of_points(points: FloatArray) -> NoiseFamily:
 
 
 POINTS = sheet(14, 28, 1.2)
-DISTANCE = cdist(POINTS, POINTS)
 FAMILY = of_points(POINTS)
 B = slopes(POINTS)
 
@@ -193,36 +192,6 @@ def test_intervals_hold_for_errors_other_than_stated(length: float, rough: float
         assert learned.quantities[-1].learned.median == pytest.approx(rough, rel=0.1)
         # What is left is as large as expected.
         assert np.mean(nis) == pytest.approx(1.0, abs=0.02)
-
-
-def test_a_filter_learns_the_noise_where_the_model_is_not_linear() -> None:
-    def curved(m: FloatArray) -> Prediction:
-        return Prediction(B @ (m + 0.05 * m**2), B * (1.0 + 0.1 * m))
-
-    rng = np.random.default_rng(8)
-    x = rng.standard_normal(8)
-    F = np.linalg.cholesky(matern(DISTANCE, 7.0) + 1e-9 * np.eye(len(POINTS)))
-    noise = 0.4 * F @ rng.standard_normal((len(POINTS), 3))
-    y = curved(x).y + (noise + 0.25 * rng.standard_normal(noise.shape)).ravel()
-    found = IteratedFilter(1e-6)(curved, UNIT[8], y, FAMILY)
-    assert found.converged
-    assert found.learned is not None
-    # At the end noise and estimate are most probable for each other.
-    H = B * (1.0 + 0.1 * found.mean)
-    again = learn_noise(FAMILY, y - curved(found.mean).y + H @ found.mean, H)
-    np.testing.assert_allclose(
-        again.posterior.mean, found.learned.posterior.mean, atol=0.02 * again.posterior.std.min()
-    )
-    low, high = found.innovation.nis_band
-    assert low < found.innovation.nis < high
-    assert np.all(np.abs(found.mean - x) < 3.0 * found.std)
-    smooth, length, rough = found.learned.quantities
-    for quantity, true in ((smooth, 0.4), (length, 7.0), (rough, 0.25)):
-        low, high = quantity.learned.interval(0.99)
-        assert low < true < high
-    # No more runs than with the noise given.
-    given = IteratedFilter(1e-6)(curved, UNIT[8], y, found.learned.noise)
-    assert found.forward_solves <= given.forward_solves + 1
 
 
 @pytest.mark.parametrize(

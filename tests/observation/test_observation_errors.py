@@ -5,7 +5,6 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.estimation import observation_noise
-from mvest.estimation.noise import stacked_noise
 from mvest.observation.errors import (
     AnnulusOffset,
     CoaptationDropout,
@@ -107,27 +106,6 @@ def test_the_annulus_offset_moves_the_closed_frame_as_one() -> None:
     np.testing.assert_allclose(seen[1] - true[1], np.tile([0.0, 0.5, 1.0], (6, 1)))
     with pytest.raises(InputError, match="three finite"):
         AnnulusOffset((0.0, np.nan, 1.0))
-
-
-def test_structured_noise_is_the_dense_covariance() -> None:
-    correlation = SpatialCorrelation(LINE, 5.0)
-    members = np.arange(41) % 3 > 0
-    parts = [correlation.noise(0.25, 3), correlation.of(members).noise(0.04, 3)]
-    noise = stacked_noise(parts)
-    C = correlation.matrix()
-    blocks = [0.25 * np.kron(C, np.eye(3)), 0.04 * np.kron(C[np.ix_(members, members)], np.eye(3))]
-    n = sum(len(b) for b in blocks)
-    R = np.zeros((n, n))
-    R[:123, :123], R[123:, 123:] = blocks
-    assert noise.size == n
-    assert noise.log_determinant == pytest.approx(np.linalg.slogdet(R)[1], rel=1e-9)
-    W = noise.whiten(np.eye(n))
-    np.testing.assert_allclose(W @ R @ W.T, np.eye(n), atol=1e-7)
-    v = rng().normal(size=n)
-    np.testing.assert_allclose(noise.whiten(v), W @ v, atol=1e-9)
-    assert observation_noise(noise, n) is noise
-    with pytest.raises(InputError, match="expected 7"):
-        observation_noise(noise, 7)
 
 
 def test_scales_multiply_standard_deviations() -> None:

@@ -17,7 +17,7 @@ from mvest.estimation.transform import Identity, Log, to_filter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.personalisation import estimation, personalise
 from mvest.personalisation.chain import predicted_frames
-from mvest.personalisation.estimation import SETTLED, CaseProblem, linearised
+from mvest.personalisation.estimation import SETTLED, CaseProblem
 from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
 from mvest.personalisation.joint import JointPosterior, damped_step
 from mvest.problem.registration import REGISTRATION
@@ -217,25 +217,6 @@ def test_relinearisation_ends_at_the_joint_mode_of_moduli_and_geometry(monkeypat
     else:
         # Twelve steps do not reach the end of such a valley, although the estimate is there.
         assert fit.moved > CHECKS["moved"].limits[0]
-
-
-def test_a_point_at_the_mode_leaves_nothing_unaccounted(monkeypatch, steps):
-    case, known = bent_case(monkeypatch, curve=0.0)
-    monkeypatch.setattr(estimation, "ROUGH", 0.0)
-    fit = renewed(case, known, 6, tolerance=1e-9)
-    # In a straight valley the first step is the last.
-    ((problem, before, first, last),) = steps
-    last = linearised(last, problem)
-    assert fit.moved < 1e-4
-    assert fit.unaccounted == ()
-    # As if nothing else were better: the last point is the mode, the first one is not.
-    for result, point, expected in (
-        (fit.result, last, last),
-        (before, first, "no step towards it fits the observation better"),
-    ):
-        monkeypatch.setattr(estimation, "_displaced", lambda *_: (np.inf, None))
-        found = estimation._nearer(problem, result, point)
-        assert found is expected or found == expected
 
 
 def test_held_out_frames_have_the_displaced_boundary(monkeypatch):

@@ -23,7 +23,6 @@ from mvest.personalisation.estimation import CaseProblem
 from mvest.personalisation.known import IMAGES
 from mvest.personalisation.model import held_state
 from mvest.personalisation.sources import FrameSamples
-from mvest.problem.registration import REGISTRATION
 from tests.made_up_closure import (
     CLOSED_ANNULUS,
     MECHANICS,
@@ -82,14 +81,6 @@ def test_moduli_alone_are_the_estimate_without_nuisances(formula):
     assert fixed.result.parameters == alone.parameters == MODULI
     np.testing.assert_array_equal(fixed.result.estimate, alone.estimate)
     np.testing.assert_array_equal(fixed.result.std, alone.std)
-
-
-def test_unknowns_may_come_in_any_order():
-    case = made_up_case(0.3)
-    one, other = (personalise(case, settings(*u)) for u in (unknowns(), unknowns()[::-1]))
-    assert set(other.result.parameters[-6:]) == set(REGISTRATION)
-    at = [other.result.parameters.index(name) for name in one.result.parameters]
-    np.testing.assert_allclose(other.result.estimate[at], one.result.estimate, rtol=1e-6, atol=1e-9)
 
 
 def covariance(R, size):

@@ -3,14 +3,13 @@
 import re
 
 import numpy as np
-import pytest
 
-from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction, identifiability
+from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import Problem, estimate
 from mvest.problem.registration import label_of
-from mvest.reporting.expectation import expectation_text, trade_off_text
+from mvest.reporting.expectation import expectation_text
 
 NAMES = ("E_f.anterior", "E_f.posterior", "pressure_scale")
 TRUTH = np.array([6.0, 2.0, 1.0])
@@ -70,12 +69,3 @@ def test_the_text_names_parameters_that_are_poorly_determined():
     # Only p/a and p/b are determined well: a higher pressure raises both moduli alike.
     assert text.count("+10 % of") == 3
     assert "Poorly determined by the data alone" in text
-    H = bellies(TRUTH).jacobian[12:]
-    (group,) = identifiability(H, 0.02**2, TRUTH, names=NAMES).confounded()
-    change = dict(zip(group.parameters, group.changes, strict=True))
-    assert change == pytest.approx(
-        {"E_f.anterior": 0.6, "E_f.posterior": 0.2, "pressure_scale": 0.1}, rel=0.02
-    )
-    labelled = trade_off_text(group, {"pressure_scale": "the pressure"})
-    assert "of the pressure" in labelled
-    assert "pressure_scale" not in labelled

@@ -28,14 +28,6 @@ def test_iterates_band_and_truth_are_drawn() -> None:
         assert (at_end.min(), at_end.max()) == pytest.approx((end - 2 * std, end + 2 * std))
 
 
-def test_several_estimates_are_lines_without_bands() -> None:
-    cases = [made_up_estimate(case=name) for name in ("one", "other")]
-    axes, _ = iterates_figure([*cases, made_up_estimate(None)]).axes
-    assert [line.get_label() for line in axes.lines] == ["one", "other", "truth"]
-    assert not axes.collections
-    assert iterates_figure([made_up_estimate(None)]) is None
-
-
 def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:
     names = [save_figure_with(tmp_path / base, drawn(), LINE, pdf=True) for base in ("a", "b")]
     for first, second in zip(*names, strict=True):

@@ -1,9 +1,8 @@
 import re
 
-import pytest
 from markdown_it import MarkdownIt
 
-from mvest.reporting.markup import markdown_rows, number
+from mvest.reporting.markup import markdown_rows
 from mvest.reporting.tables import table
 
 HOSTILE = r"<script>alert('x')</script> | `a` *b* [c](javascript:d) _e_ 5 % & $x$ \input{f} #1 ~"
@@ -28,15 +27,3 @@ def test_latex_prints_every_special_character() -> None:
     for escaped in (r"input\{f\}", r"\$x\$ ", r"5 \% \& ", r"\#1 \textasciitilde", "x-y z & –"):
         assert escaped in tex
     assert tex.startswith("\\begin{tabular}{lr}\n\\toprule\n")
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "–"),
-        (6.2296, "6.23"),
-        (2e-5, "2.0e-05"),
-    ],
-)
-def test_numbers_are_rounded(value: float | None, text: str) -> None:
-    assert number(value) == text

@@ -8,7 +8,6 @@ import pytest
 from mvest.cases.from_images.detector_errors import (
     coverage,
     error_at_shape,
-    in_mirror,
     without_expected_error,
 )
 from mvest.errors import InputError
@@ -29,19 +28,6 @@ def made_up(seed, count, noise, law=0.0):
     shapes = 20.0 + np.tensordot(amplitude, modes, 1)
     errors = bias[0] + law * np.tensordot(amplitude, follows, 1)
     return shapes, errors + noise * rng.normal(size=errors.shape), errors
-
-
-def test_a_mirror_swaps_sides_and_is_undone_by_itself():
-    # Tips that stay on their side; x that keeps its sign; a layout that is turned.
-    rng = np.random.default_rng(0)
-    moves = rng.normal(size=(3, 2, POINTS, 3))
-    np.testing.assert_array_equal(in_mirror(SMALL, in_mirror(SMALL, moves)), moves)
-    at = np.zeros((POINTS, 3))
-    at[SMALL.vertex(45.0, 1)] = 1.0, 2.0, 3.0
-    at[-2] = 4.0, 5.0, 6.0
-    there = in_mirror(SMALL, at)
-    np.testing.assert_array_equal(there[SMALL.vertex(135.0, 1)], [-1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(there[-1], [-4.0, 5.0, 6.0])
 
 
 def test_what_is_stated_covers_the_errors_of_further_valves():

@@ -44,7 +44,6 @@ def test_the_closed_frame_has_all_and_the_open_one_no_tenting(rows):
         for what in ("tenting", "prolapse", "billow")
         for part in ("height_mm", "volume_mm3")
     }
-    assert (opened["frame"], opened["time_s"], opened["confidence"]) == (1, 0.04, 0.9)
     assert opened["orifice_mm2"] > 100 > closed["orifice_mm2"]
     # The annulus stands still, the tips come 0.8 mm nearer.
     assert closed["annulus_area_mm2"] == pytest.approx(opened["annulus_area_mm2"])

@@ -8,20 +8,10 @@ from mvest.estimation import (
     Gaussian,
     IteratedFilter,
     Prediction,
-    chi_square_band,
     moran,
     nees,
 )
 from tests.estimation.problems import consistent
-
-
-@pytest.mark.parametrize(
-    ("freedom", "level", "band"),
-    # Tables of the chi-square distribution at 2.5 and 97.5 %, 5 and 95 %.
-    [(1, 0.95, (0.000982, 5.024)), (10, 0.95, (3.247, 20.483)), (100, 0.90, (77.929, 124.342))],
-)
-def test_chi_square_band(freedom, level, band):
-    assert chi_square_band(freedom, level) == pytest.approx(band, rel=3e-4)
 
 
 def test_statistics_by_hand():

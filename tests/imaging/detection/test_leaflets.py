@@ -75,21 +75,6 @@ def test_samples_say_where_the_true_rim_is(shape, other, rim):
 # -- leaflets ------------------------------------------------------------------------------------
 
 
-def normals(x, layout):
-    return module.leaflet_axes(x, layout)[:, :, 2]
-
-
-def test_the_gap_is_along_the_guess_normal_not_the_shortest():
-    # A plane seen at 45 degrees is farther away by the square root of two.
-    u, v = np.meshgrid(np.arange(16.0), np.arange(7.0))
-    grid = np.stack([u, v, np.zeros_like(u)], -1).reshape(-1, 3)
-    at = np.array([made.LAYOUT.columns * 3 + 8])
-    facing = normals(grid, made.LAYOUT)[at]
-    slanted = (facing + np.array([[1.0, 0, 0]])) / np.sqrt(2)
-    gap = module._gap(grid[at] - 1.0 * facing, slanted, at, grid, made.LAYOUT)
-    assert gap[0] == pytest.approx(np.sqrt(2), abs=1e-9)
-
-
 def test_votes_spread_by_their_distance():
     # Votes on spheres about two points: their root mean square distances are the radii.
     ray = np.random.default_rng(1).standard_normal((1, 200, 3))

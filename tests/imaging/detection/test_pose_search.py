@@ -28,16 +28,6 @@ def search(shape, true, share=0.8):
     return {"pose_coarse": rating, "pose_fine": rating, **steps}
 
 
-def test_refinement_takes_back_a_share_at_every_step(shape, true):
-    # One step skipped, or a step applied in world axes, leaves more than this.
-    start = true.pose.moved(np.array([[6.0, -4.0, 3.0, 0.3, -0.2, 0.3, 0.1]]))
-    before = start.towards(true.pose)[0]
-    found, _ = pose_search.refined(made.NumberedFrame(), search(shape, true, 0.5), start)
-    after = found.towards(true.pose)[0]
-    np.testing.assert_allclose(after[6], before[6] / 8, atol=1e-9)
-    assert np.linalg.norm(after[:3]) == pytest.approx(np.linalg.norm(before[:3]) / 8, rel=0.05)
-
-
 @pytest.mark.parametrize("step", range(len(pose_search.REFINEMENTS)))
 def test_what_samples_of_refinement_say_takes_them_back(true, step):
     x, y = pose_search.refinement_samples(made.labelled(true, None, step), step, 30)

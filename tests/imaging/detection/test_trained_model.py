@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.imaging.detection.trained_model import STAGES, load_model, save_model
+from mvest.imaging.detection.trained_model import load_model, save_model
 
 
 @pytest.fixture(scope="module")
@@ -92,12 +92,3 @@ BAD = [
 @pytest.mark.parametrize(("change", "words"), BAD)
 def test_a_wrong_file_is_refused_by_name(path, tmp_path, change, words):
     refused(altered(path, tmp_path, change), words)
-
-
-def test_all_trees_say_the_same(trained, loaded):
-    # Stages or outputs in another order, or numbers rounded in the text, fail here.
-    rng = np.random.default_rng(0)
-    for name in STAGES:
-        before, after = trained.boosters[name], loaded.boosters[name]
-        x = rng.uniform(0, 255, (20, before.features)).astype(np.float32)
-        np.testing.assert_array_equal(after(x), before(x))

@@ -148,25 +148,6 @@ def test_noise_has_the_levels_set(settings, within):
     assert 10 * math.log10(np.mean(noise**2)) == pytest.approx(-20, abs=within)
 
 
-def correlation(a, b):
-    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
-
-
-def test_speckle_moves_with_the_tissue():
-    # By whole samples in depth.
-    tissue = block()
-    grid, still = render(QUIET, tissue)
-    n = 4
-    r = np.linalg.norm(tissue.points, axis=1, keepdims=True)
-    moved = tissue.points * (r + n * grid.distance.step) / r
-    _, after = render(QUIET, Echoes(moved, tissue.amplitude, tissue.loss))
-    back = np.roll(after, -n, axis=2)
-    assert correlation(inner(grid, still), inner(grid, back)) > 0.9
-    assert correlation(inner(grid, still), inner(grid, after)) < 0.5
-    _, other = render(QUIET, block(seed=1))
-    assert abs(correlation(inner(grid, still), inner(grid, other))) < 0.15
-
-
 def test_there_is_shadow_behind_dense_tissue_and_nowhere_else():
     losses = losses_of(BeamGrid.of(QUIET), slab(10.0), FLAT)
     points = [[-8.0, 0.0, 60.0], [8.0, 0.0, 60.0], [-5.0, 0.0, 33.0]]

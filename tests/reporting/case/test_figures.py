@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection, QuadMesh
 
-from mvest.errors import InputError
 from mvest.problem.fields import case_fields
 from mvest.reporting.case.drawing import (
     LINE_PIECES,
-    distance_top,
     leak_of,
 )
 from mvest.reporting.case.figures import case_figure, estimates_figure, frames_figure, shapes_figure
@@ -70,11 +68,6 @@ def test_a_valve_is_turned_the_same_way_however_it_lies(case, fields) -> None:
     assert SIDE.axes[2, 1] > 0.9
 
 
-def test_a_file_without_the_shapes_of_a_case_is_refused() -> None:
-    with pytest.raises(InputError, match="arrays: no fields of a case"):
-        case_fields({"frames": ["closed"]})
-
-
 def test_both_panels_of_figure_3_have_one_scale(fields) -> None:
     """2 mm everywhere next to 1 mm: each on a scale of its own, they would look alike."""
     two = np.full_like(fields.distance_generic, 2.0)
@@ -102,29 +95,6 @@ def test_figure_3_draws_the_frame_that_was_shown_to_the_filter_and_greys_the_uns
         colour = faces(figure.axes[0]).get_facecolor()
         grey = (np.ptp(colour[:, :3], axis=1) < 1e-9) & (colour[:, 0] > 0.3)
         assert grey.sum() == touched * pieces(figure.axes[0], fields) > 0
-
-
-def test_scales_end_at_a_round_number_above_all_but_outliers() -> None:
-    for largest, top in ((2.1, 2.5), (0.31, 0.35), (5.0, 5.0), (0.0, 1e-3)):
-        assert distance_top(np.full(9, largest)) == pytest.approx(top)
-    values = np.full(1000, 0.9)
-    values[3] = 50.0
-    assert distance_top(values) == pytest.approx(0.9)
-
-
-def test_a_valve_with_holes_is_drawn_without_them_on_one_scale(fields) -> None:
-    panels = shapes_figure(fields, NAMES).axes
-    titles = [axes.get_title() for axes in panels[:3]]
-    assert titles == ["open (reference)", "closed, observed", "closed, personalised model"]
-    counts = [len(faces(axes).get_paths()) for axes in panels[:3]]
-    lost = np.isnan(fields.observed[0]).any(axis=1)[fields.triangles].any(axis=1).sum()
-    assert lost > 0
-    # A closed valve hides its chordae and the tips, which are discs of 24 triangles.
-    chords = len(fields.chord_tip) * LINE_PIECES + 24 * fields.tips.shape[1]
-    assert counts[0] - chords == counts[2] > counts[1] + lost
-    for row in (panels[:3], panels[3:]):
-        assert len({(*axes.get_xlim(), *axes.get_ylim()) for axes in row}) == 1
-        assert all(axes.get_aspect() == 1.0 for axes in row)
 
 
 def marked(axes, marker) -> list[float]:

@@ -81,11 +81,7 @@ def test_a_page_begins_with_the_moduli_and_has_every_section_and_picture(case, h
     # 5.8 ± 1.96 x 0.8 and 2.2 ± 1.96 x 0.3, to two digits.
     assert f"{ANSWER} E_f posterior 2.2 MPa 1.6 to 2.8 MPa" in page.text
     assert page.text.index(ANSWER) < page.text.index("Contents")
-    for part in (
-        "SIMULATED", "NOT FOR DIAGNOSIS", "taken from the literature.", "ratio of E_f anterior",
-        "+10 % of E_f anterior with −3.1 % of slack of the chordae", "Frame late was not shown",
-        "frame “closed”",
-    ):  # fmt: skip
+    for part in ("SIMULATED", "NOT FOR DIAGNOSIS", "Frame late was not shown"):
         assert part in page.text
     # The made-up late frame is nearer to the personalised valve.
     assert "NOT nearer" not in page.text
@@ -110,18 +106,6 @@ def test_the_page_loads_nothing_and_is_not_too_large(written, html) -> None:
     header, first = written[0].read_text(encoding="utf-8").splitlines()[:2]
     values = dict(zip(header.split(","), first.split(","), strict=True))
     assert (values["name"], float(values["estimate"])) == ("E_f.anterior", 5.8)
-
-
-def test_the_scene_shows_one_state_at_a_time(html) -> None:
-    shown = re.findall(r'data-shown="([^"]*)">([^<]*)<', html)
-    assert [label for _, label in shown] == [
-        "open", "closed, observed", "closed, generic", "closed, personalised",
-        "observed (grey) over personalised",
-    ]  # fmt: skip
-    visible = np.array([[word == "true" for word in re.findall(r"\w+", v)] for v, _ in shown])
-    # Every trace belongs to exactly one state.
-    assert (visible.sum(axis=0) == 1).all()
-    assert visible.any(axis=1).all()
 
 
 def test_an_almost_empty_record_has_a_page(case, tmp_path) -> None:
@@ -180,15 +164,6 @@ def test_tables_of_a_record(case) -> None:
     marked = [row["estimate (95 % interval)"][-1] == "✗" for row in tables["moduli"].readable()]
     assert marked == [True, False]
     # 0.5 and 0.71 over 0.8, in per cent, the most useful first.
-    narrower = [(row["what"], row["E_f anterior"]) for row in tables["narrower"].rows]
-    assert narrower == [
-        ("if the chordae were known", pytest.approx(62.5)),
-        ("if the pressure were known", pytest.approx(88.75)),
-    ]
-    shares = [(row["source"], row["E_f anterior"]) for row in tables["shares"].rows]
-    assert shares == [("thickness", 60.0), ("pressure (factor)", 39.5)]
-    first, *_, volume, length = tables["measurements"].rows
-    assert list(first) == ["measurement", "open, observed", "closed, generic"]
-    assert first["measurement"] == "AP diameter [mm]"
-    assert (volume["measurement"], volume["closed, generic"]) == ("tenting volume [mm³]", 1840.0)
-    assert length["closed, generic"] is None
+    assert [row["E_f anterior"] for row in tables["narrower"].rows] == pytest.approx([62.5, 88.75])
+    *_, volume, length = tables["measurements"].rows
+    assert (volume["closed, generic"], length["closed, generic"]) == (1840.0, None)
