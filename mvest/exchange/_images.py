@@ -151,8 +151,8 @@ def nifti(path: Path, begin: bytes) -> Opened:
     ), load
 
 
-# MetaImage is LPS in mm; the fourth spacing is the time between frames, without a unit. ITK invents
-# missing fields, and voxels of damaged compressed data.
+# MetaImage is LPS in mm; the fourth spacing is the time between frames, without a unit. ITK makes
+# up missing fields, and voxels where compressed data are damaged.
 
 METAIMAGE_FIELDS = (
     ("ElementSpacing",),

@@ -1,6 +1,6 @@
-r"""FEBio's input file, its elements and materials, after the reader of FEBio 4.11 (``FEBioXML``).
+r"""FEBio's input file, elements and materials, following the FEBio 4.11 reader (``FEBioXML``).
 
-Numbers keep all digits.
+Numbers are written with all digits.
 
 FEBio has no linear law of the Biot strain, :math:`\tfrac12 \epsilon : C : \epsilon`
 (:mod:`mvest.mechanics.law.biot`). Two of its materials have the same stiffness at rest:
