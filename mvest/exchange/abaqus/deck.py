@@ -123,7 +123,7 @@ class Deck:
         return members
 
     def share(self, amplitude: str, times: FloatArray) -> FloatArray:
-        """Share of the pressure at times ``(k,)`` s, constant before and after.
+        """Fraction of the pressure at times ``(k,)`` s, constant outside the amplitude's points.
 
         Between two points it is Abaqus' smooth step ``10 u^3 - 15 u^4 + 6 u^5``.
 

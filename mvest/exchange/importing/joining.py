@@ -250,7 +250,7 @@ def _facing_ventricle(
         arcs = candidate.arcs(commissures)
         to = other.vertices if contour is None else contour
         away = [float(_nearest(candidate.vertices[arc], to)[0].mean()) for arc in arcs]
-        # The annulus is nearer to the contour, or else farther from the other leaflet.
+        # The annulus is the arc nearer to the contour, or else farther from the other leaflet.
         annulus = arcs[int(np.argmax(away) if contour is None else np.argmin(away))]
         ring = np.vstack([candidate.vertices[annulus], other.curve.mean(0)])
         if loop_vector_area(ring) @ down > 0:
@@ -313,7 +313,7 @@ def _seam(a: FloatArray, b: FloatArray, given: tuple[float, float] | None) -> tu
 
 
 def _strip(vertices: FloatArray, a: IntArray, b: IntArray) -> tuple[IntArray, IntArray, float]:
-    """Triangles between two rows of vertices, the row with two corners of each, and their width.
+    """Triangles between two rows of vertices, the row with two of their corners, and the width.
 
     The first row follows its leaflet's boundary, the second opposes it. The next triangle is the
     one with the shorter new edge.
