@@ -41,8 +41,8 @@ MAX_GAP = 6.0
 MAX_MISS = 8.0
 """Largest distance (mm) along a leaflet's boundary of a marked commissure from the true one."""
 CORNER, SETTLED = 3.0, 0.15
-"""Past a corner, over the first length (mm), the distance to the other leaflet falls by at most the
-second (mm)."""
+"""At a corner the distance to the other leaflet comes within the second length (mm) of its smallest
+value, which is searched over the first length (mm)."""
 OPENING = 0.4
 """Free edges begin to part where their distance exceeds that at the corner by this (mm)."""
 CURL_AT, CURLED = (0.0, 0.6, 1.5, 2.5), 0.85

@@ -60,7 +60,7 @@ _TABLES = {
     "ValveLandmarkPoints.csv": ("LandmarkLabel", [f"Landmark{k}" for k in "RAS"]),
 }
 MIN_CONTOUR = 8
-"""Landmarks on the annulus."""
+"""Smallest number of annulus points."""
 MAX_FILES = 20_000
 
 
