@@ -102,7 +102,7 @@ def _plain(array: Any, where: str) -> NDArray[Any]:
 def check_array(
     array: NDArray[Any], where: str, kind: str, shape: Sequence[int | None]
 ) -> NDArray[Any]:
-    """An array as text (kind U), 64-bit integers (i) or finite numbers (f), of a given shape.
+    """Convert an array to text (kind U), 64-bit integers (i) or finite numbers (f) of a shape.
 
     A length of None matches any. ``where`` names the array in errors.
 
