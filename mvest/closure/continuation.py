@@ -16,7 +16,7 @@ from mvest.typing import FloatArray
 
 STIFFENED = 0.5
 """Factor on log(1 + stiffening). Five steps of 0.2 then lead from tissue that hardly stiffens to
-nearly exponential tissue, and a leaflet moves no farther in a step than with its modulus."""
+nearly exponential tissue. A leaflet moves no farther per step than per step of its modulus."""
 
 
 SPACING = 0.4

@@ -31,7 +31,7 @@ MUSCLES = ("antero-lateral", "postero-medial")
 
 @dataclass(frozen=True, slots=True)
 class SlicerOptions:
-    """This exporter has no options."""
+    """The exporter has no options."""
 
 
 def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:

@@ -389,7 +389,7 @@ def _smoothed(sheet: FloatArray) -> FloatArray:
 
 
 def _thickness(sheet: FloatArray, first: Wall, second: Wall) -> FloatArray:
-    """Sum ``(rows, columns)`` mm of the distances to both walls; near an edge that inside of it."""
+    """Sum ``(rows, columns)`` mm of the distances to both walls; edges get the value farther in."""
     shape = sheet.shape[:2]
     points = sheet.reshape(-1, 3)
     total = sum(

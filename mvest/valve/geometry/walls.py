@@ -29,8 +29,8 @@ MAX_THICKNESS = 8.0
 """Diameter of the first ball, mm; diseased leaflets are up to 5 mm thick."""
 BALL_ROUNDS = 40
 MIN_SEPARATION = np.cos(np.radians(40.0))
-"""Cosine of the angle between the two contacts of a ball, seen from its centre, at which shrinking
-stops: a smaller angle means roughness of the same wall."""
+"""Shrinking stops at this cosine of the angle between a ball's two contacts, seen from its centre.
+A smaller angle means roughness of the same wall."""
 OPPOSITE = -0.6
 """Largest scalar product of the normals of two opposite points."""
 ACROSS_WEIGHT = 0.1
