@@ -52,11 +52,11 @@ def measure_steps(
     Returns
     -------
     list of dict
-        For each step ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening between the
-        thick leaflets along the best annulus normal; ``coaptation`` (mm), the height in the middle
-        of the valve over which the leaflets are within the contact distance; ``intersections``,
-        pairs of intersecting triangles of the leaflets' faces; the largest ``chord strain`` and
-        ``chord force`` (N); ``smallest det F`` of the quadrature points; ``Newton iterations``.
+        For each step: ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening between the
+        thick leaflets along the best annulus normal; ``coaptation`` (mm), the height at mid-valve
+        over which the leaflets are within the contact distance; ``intersections``, pairs of
+        intersecting triangles of the leaflets' faces; the largest ``chord strain`` and ``chord
+        force`` (N); ``smallest det F`` at the quadrature points; ``Newton iterations``.
     """
     valve, system, simulation = model.valve, result.system, result.simulation
     surface, mesh = valve.surface, model.mesh
