@@ -1,4 +1,4 @@
-"""Estimates your own valve: from a case folder to moduli with intervals."""
+"""Estimates moduli with intervals for your own valve, from a case folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Closes, gates and estimates imported valves.
+"""Closures, gate runs and estimates of imported valves.
 
 The study fits a recorded closure (``donor``) to its closed frame from several starts. It meshes and
 closes the shape of a reference heart (``heart``), and estimates known moduli on it. The data are

@@ -1,4 +1,4 @@
-"""Estimates your own volume over time: from images to moduli with intervals."""
+"""Estimates moduli with intervals from your own volume over time."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class LeafletsOptions:
     observer_mm : float
         Standard deviation of the drawn walls; 0 for a voxelised model.
     mirrored : bool
-        Accept a valve that is its own mirror image.
+        Accept a mirrored valve.
     """
 
     anterior: Any = None

@@ -66,7 +66,7 @@ class SlicerheartOptions:
     std_mm : float or None
         Standard deviation of a coordinate of the surfaces; 1 mm by default.
     mirrored : bool
-        Accept a valve that is its own mirror image.
+        Accept a mirrored valve.
     """
 
     scene: str | None = None

@@ -27,7 +27,7 @@ def smooth_vertex_normals(
 ) -> FloatArray:
     """Unit normals ``(n, 3)`` after Laplacian smoothing over neighbouring vertices.
 
-    Each iteration replaces a normal by the normalised mean of itself and its neighbours' mean one.
+    Each iteration averages a normal with the mean of its neighbours' normals, and normalises it.
     Thickening along raw normals would make triangles cross at sharp bends, such as the commissures.
 
     Raises
