@@ -1,1 +1,1 @@
-"""One room a study."""
+"""One module per study."""

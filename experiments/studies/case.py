@@ -1,4 +1,4 @@
-"""Your own valve: from a case folder to moduli with intervals."""
+"""Estimates moduli with intervals for your own valve, from a case folder."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from mvest.cases.plausibility import require_plausible
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     case: CaseInput = None  # folder of a case
-    strict: bool = False  # refuse an implausible case instead of warning
+    strict: bool = False  # reject an implausible case instead of warning
     gate: bool = False  # with check=true: test whether the closed state is unique (minutes)
     personal: PersonalSettings
 

@@ -1,7 +1,7 @@
-"""Information in the frames of a whole cycle, errors of time steps, and estimates from them.
+"""Information in the frames of a whole cycle, time step errors, and estimates from the frames.
 
-All results are from one simulated cycle of a valve with known parameters. The experiments `cycle`,
-`joint`, `joint_open` and `chord` differ in the unknowns and in the estimates.
+All results come from one simulated cycle of a valve with known parameters. The experiments `cycle`,
+`joint`, `joint_open` and `chord` differ in their unknowns and estimates.
 """
 
 from __future__ import annotations
@@ -40,38 +40,38 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EXACT, TWO, WHOLE, OTHER = "no noise", "open and closed", "whole cycle", "another mesh"
-"""Observations for estimates; all but the second are of all frames."""
+"""Observations for estimates; all but the second include all frames."""
 WIDER = f"{OTHER}, with the mesh's error"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CycleSettings:
-    """The simulation and the estimates; meshes are columns and rows of cells, then of contacts."""
+    """The simulation and the estimates; a mesh is columns and rows of cells, then of contacts."""
 
     protocol: CycleProtocol = field(default_factory=CycleProtocol)
     noise_mm: Length = 0.5  # SD of each coordinate
-    estimated: tuple[str, ...] = ()  # of no noise, open and closed, whole cycle, another mesh
+    estimated: tuple[str, ...] = ()  # from no noise, open and closed, whole cycle, another mesh
     exact_assumed_mm: Length = 0.1  # SD that the filter assumes for coordinates without noise
-    seeds: Count = 8  # of the noise of the whole cycle
+    seeds: Count = 8  # for the noise of the whole cycle
     # A search that starts near its end stops when the objective decreases by less than this: 0.02
     # moves no parameter by more than a fifth of its standard deviation, 0.05 by a third.
     objective_tolerance: Tolerance = 0.02
     finer: tuple[AxisCount, ...] = (32, 4, 96, 21)  # mesh of the truth in "another mesh"
     check: tuple[AxisCount, ...] = (40, 5, 120, 26)  # mesh for the error of the estimator's mesh
-    time_steps: tuple[TimeStep, ...] = ()  # s, each half of the last, to be compared
-    path_steps: Count = 16  # steps of the path on which frames are tested for jumps
+    time_steps: tuple[TimeStep, ...] = ()  # s, to compare; each half of the last
+    path_steps: Count = 16  # steps of the path that tests for jumps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
 
 FINER_STEP, PATH_CHANGE = 0.5, -0.3
-"""Time step on other meshes over the estimator's, and relative change of the first parameter along
-the path on which frames are tested for jumps."""
+"""Time step on other meshes relative to the estimator's, and relative change of the first parameter
+along the path that tests frames for jumps."""
 
 
 def run_cycle(job: Job[Settings]) -> Result:
@@ -80,7 +80,7 @@ def run_cycle(job: Job[Settings]) -> Result:
     Raises
     ------
     InputError
-        If the truth has no cycle on one of the meshes, or a setting is inadmissible.
+        If the true cycle fails on one of the meshes, or a setting is inadmissible.
     """
     values, settings = job.values, job.settings.cycle
     truth = np.array(values["truth"]["values"], dtype=float)
@@ -132,7 +132,7 @@ def _estimates(
     truth: FloatArray,
     numbers: dict[str, Number],
 ) -> Iterator[EstimateRecord]:
-    """Estimates of all parameters from observations of one true cycle."""
+    """Estimate all parameters from observations of one true cycle."""
     if not set(settings.estimated) <= {EXACT, TWO, WHOLE, OTHER}:
         known = f"{EXACT}, {TWO}, {WHOLE}, {OTHER}"
         raise ConfigurationError(
@@ -188,7 +188,7 @@ def _on_mesh(values: Values, settings: CycleSettings, mesh: tuple[int, ...]) -> 
 
 
 def _bar(title: str, model: CycleModel, solves: int, names: Sequence[str] = ()) -> SolveBar:
-    """A progress bar of a model's steps."""
+    """A progress bar for a model's steps."""
     bar = SolveBar(title, len(model.protocol.steps()), solves, names)
     model.closure.on_step = bar.step
     return bar
@@ -213,7 +213,7 @@ def _observation(
 
 
 def expect_cycle(values: Values, _folder: Path | None = None) -> str:
-    """The text of ``check=true``: expected intervals from all frames of a cycle."""
+    """Text for ``check=true``: expected intervals from all frames of a cycle."""
     settings = build(CycleSettings, values["cycle"])
     model, problem = _problem(values, settings)
     at = settings.protocol.frame_sets()[WHOLE]
@@ -225,7 +225,7 @@ def expect_cycle(values: Values, _folder: Path | None = None) -> str:
 
 
 def figure(results: Results) -> Figure:
-    """Bounds of sets of frames, and the errors of estimates if there are any."""
+    """Bounds for sets of frames, and the errors of estimates if there are any."""
     from mvest.reporting.figures import COLOURS, MARKERS, SMALL, log_axis, panels
 
     estimates = results.first.estimates

@@ -1,8 +1,8 @@
-"""Comparison of observations before any are made, from exact derivatives.
+"""Compares observations before they are made, using exact derivatives.
 
 The experiment `identifiability` varies frames, vertices, errors and the knowledge of nuisances for
-one configured valve. `design` varies the number of closed frames and the errors of their pressures
-for virtual patients, and makes estimates for some designs.
+one configured valve. The experiment `design` varies the number of closed frames and their pressure
+errors for virtual patients, and makes estimates for some designs.
 """
 
 from __future__ import annotations
@@ -59,23 +59,23 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DesignsSettings:
-    """Observations of the configured valve that are compared."""
+    """Observations of the configured valve to compare."""
 
-    pressures_mmHg: tuple[Pressure, ...] = (60.0,)  # of one more closed frame
+    pressures_mmHg: tuple[Pressure, ...] = (60.0,)  # of one additional closed frame
     cycle_times: tuple[BeatTime, ...] = ()  # s, observed in a whole cycle
     cycle_dt: TimeStep = 0.003125  # s
     noise_mm: tuple[Length, ...] = (0.1, 0.25, 0.5, 1.0)
-    typical_mm: Length = 0.5  # noise of tables for a single noise
+    typical_mm: Length = 0.5  # noise in tables that show one noise
     correlation_length_mm: Length = 5.0
-    target: Share = 0.05  # wanted relative standard deviation of a modulus
-    # Knowledge -> relative standard deviations of nuisances; 0 is known, and missing is unknown.
+    target: Share = 0.05  # required relative standard deviation of a modulus
+    # Knowledge -> relative standard deviations of nuisances; 0: known, missing: unknown.
     knowledge: dict[str, dict[str, Factor]] = field(default_factory=dict)
     known: tuple[str, ...] = ()  # parameters taken as known in the table of confounded ones
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corner:
-    """A design for which a patient is estimated; its errors are stated and drawn."""
+    """A design for which a patient is estimated; its stated errors are also drawn."""
 
     frames: Count = 1  # closed frames, the first with the pressure of the closed frame
     factor: Factor = 0.1  # relative, on all pressures
@@ -93,7 +93,7 @@ class FramesSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration: for the configured valve, or for a patient."""
+    """Settings that the study adds: for the configured valve, or for a patient."""
 
     designs: DesignsSettings = field(default_factory=DesignsSettings)
     frames: FramesSettings | None = None
@@ -113,7 +113,7 @@ def run(job: Job[Settings]) -> Result:
 
 # -- one configured valve -------------------------------------------------------------------------
 def _valve_designs(values: Values, settings: DesignsSettings) -> Result:
-    """All designs from the derivatives of one run for each set of frames."""
+    """All designs, from the derivatives of one run per set of frames."""
     model = replace(closure_model(values), continuation=True)
     truth = np.array(values["truth"]["values"], dtype=float)
     require_one_each("truth.values", truth, model.names)
@@ -148,7 +148,7 @@ def _valve_designs(values: Values, settings: DesignsSettings) -> Result:
 def _jacobians(
     settings: DesignsSettings, model: ClosureModel, truth: FloatArray
 ) -> dict[str, list[FloatArray]]:
-    """Label -> derivatives ``(3n, p)`` of its frames; GeometryError if the valve does not close."""
+    """Label -> derivatives ``(3n, p)`` of frames; GeometryError if the valve does not close."""
     protocol = model.settings.protocol
     peak, closed = protocol.pressure_mmHg, dict[float, FloatArray]()
     for pressure in (*settings.pressures_mmHg, peak):
@@ -200,7 +200,7 @@ def _designs(
 
 
 def _expected(settings: DesignsSettings, design: Design) -> Iterator[Row]:
-    """Each modulus with each knowledge of the nuisances."""
+    """Each modulus for each level of knowledge of the nuisances."""
     moduli = [name for name in design.names if name.startswith("E_f.")]
     for (knowledge, stds), name in product(settings.knowledge.items(), moduli):
         row: Row = {"knowledge of the nuisances": knowledge, "parameter": name}
@@ -216,7 +216,7 @@ VALUES, ANATOMY, ERRORS = range(3)
 
 
 def _patient_designs(job: Job[Settings], frames: FramesSettings, about: PatientSettings) -> Result:
-    """All designs for a patient's valve with the generic moduli, and estimates for some."""
+    """All designs for a patient's valve with generic moduli, and estimates for some."""
     patient = _patient(job.values, about, Corner(), ())
     wanted = settings_of(job.values, job.settings.personal)
     known = {"exact": None} | ({"considered": frames.geometry} if frames.geometry else {})
@@ -275,7 +275,7 @@ def _tried(
     name: str,
     corner: Corner,
 ) -> tuple[EstimateRecord, dict[str, float]]:
-    """An estimate of the patient with a design, and the predicted errors of the moduli."""
+    """An estimate of the patient under a design, and the predicted errors of the moduli."""
     further = tuple(designs.pressures_mmHg[k] for k in designs.chosen(corner.frames))[1:]
     unknowns = tuple(
         replace(u, std=corner.factor) if u.name == "pressure_scale" else u for u in wanted.unknowns
@@ -300,7 +300,7 @@ TRIED: dict[str, Column | str] = {
 def _compared(
     record: EstimateRecord, predicted: Mapping[str, float], knowledge: Mapping[str, float]
 ) -> Iterator[Row]:
-    """The predicted and the actual error of each modulus with a design."""
+    """The predicted and the actual error of each modulus under a design."""
     for name, share in predicted.items():
         own, scale = record.unknown(name), knowledge[name] / 100
         estimate, truth, generic = own.estimate, own.truth or np.nan, own.prior_mean or np.nan
@@ -332,7 +332,7 @@ def summary(results: Results) -> dict[str, Table]:
         worse = worst.loc[:, frame[known].unique()]
         columns = dict.fromkeys(OBSERVATION, "") | dict.fromkeys(worse.columns, "%:.2g")
         return {"worse_modulus": table(worse.reset_index(), **columns), **rest}
-    # The remaining error of the guess, by number of frames.
+    # The remaining fraction of the guess's error, by number of frames.
     groups = frame.groupby([*PATIENT_DESIGN, "frames"], sort=False)["left"]
     medians = groups.median().unstack().rename(columns=lambda n: f"{n} closed")
     counts = dict.fromkeys(medians.columns, "%:.0f")

@@ -1,7 +1,7 @@
-"""Estimates with any model: a program called through files, or a Python function.
+"""Estimates with any model: an external program called through files, or a Python function.
 
-A single model is fitted to observed positions. Several models are fitted to the predictions of some
-of them for known parameters.
+A single model is fitted to observed positions. If there are several models, each is fitted to
+predictions that some of them make for known parameters.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS = ("points",)
-"""The single frame that models predict."""
+"""The only frame that models predict."""
 
 FITTED = "fitted.csv"
-"""The observed points as predicted by a single model at its estimate."""
+"""The observed points, as predicted by a single model at its estimate."""
 
 
 def _command(value: tuple[str, ...], other: Values) -> Any:
@@ -56,15 +56,15 @@ class ModelSettings:
     """A program (mvest/exchange/external/README.md), or a function in a file of Python."""
 
     command: Annotated[tuple[str, ...], Reads(_command)] = ()  # program and arguments, no shell
-    # FILE:FUNCTION, which is called with the settings and returns the model.
+    # FILE:FUNCTION, called with the settings; returns the model.
     python: Annotated[str | None, Reads(_python)] = None
-    apart: bool = False  # FILE is run as a program instead, with the request and its folder
+    apart: bool = False  # run FILE as a program instead, with the request and its folder
     settings: dict[str, Any] = field(default_factory=dict)  # passed to the model unchanged
     environment: dict[str, str] = field(default_factory=dict)  # added to this process's
-    # The result depends on these files and folders, and on those in the command.
+    # Files and folders that affect the result, besides those in the command.
     inputs: Annotated[tuple[str, ...], Reads(contents)] = ()
     time_limit_s: TimeLimit = 600.0  # of one run
-    differences: Literal["central", "none"] = "central"  # none: it must give jacobian.csv
+    differences: Literal["central", "none"] = "central"  # none: program gives jacobian.csv
     relative_step: Tolerance = 1e-3  # of a parameter
     floor: Annotated[float, within(0, 1e12, "", "in the units of any model")] = 0.0  # if it is zero
     processes: Annotated[Processes, NOT_HASHED] = 1  # simultaneous runs
@@ -86,13 +86,13 @@ class ExternalSettings(ModelSettings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     external: ExternalSettings = field(default_factory=ExternalSettings)
 
 
 def problem_of(about: ExternalSettings, values: Values) -> Problem:
-    """The problem, with a model that predicts nothing.
+    """The problem, with a placeholder model.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def problem_of(about: ExternalSettings, values: Values) -> Problem:
 def model_of(
     about: ExternalSettings, parameters: tuple[str, ...], name: str, count: int, folder: Path
 ) -> ObservationModel:
-    """A configured model of ``count`` observed points.
+    """A configured model for ``count`` observed points.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def model_of(
 
 
 def _file(python: str) -> Path | None:
-    """The file of FILE:FUNCTION, in the checkout or in the working folder."""
+    """FILE in FILE:FUNCTION, in the checkout or in the working folder."""
     name = python.rpartition(":")[0]
     places = (CHECKOUT / name, Path(name).absolute())
     return next((place for place in places if place.is_file()), None)
@@ -190,7 +190,7 @@ def run(job: Job[Settings]) -> Result:
         exact = predict(model_of(about, names, name, 0, job.folder), np.array(true))
         if not exact.converged:
             return Result(status="failed", reason=f"{name}: {exact.reason}")
-        # Equal errors for all, so that only the models differ.
+        # All get the same errors, so that only the models differ.
         errors = np.random.default_rng(job.values["seed"]).standard_normal(exact.y.size)
         data[name] = (exact.y + noise_mm * errors).reshape(-1, 3)
     estimates, rows = list[EstimateRecord](), list[dict[str, Any]]()
@@ -231,11 +231,11 @@ COLUMNS: dict[str, Column | str] = {
     "forward_solves": Column(label="predictions"),
     "distance_mean": Column("mm"),
 }
-"""Columns of a record that the table shows."""
+"""Columns of a record shown in the table."""
 
 
 def check_external(values: Values, folder: Path) -> str:
-    """Run the program once at the initial values, and test its derivatives by differences.
+    """Run the program once at the initial values, and check its derivatives by differences.
 
     Raises
     ------
@@ -269,7 +269,7 @@ def check_external(values: Values, folder: Path) -> str:
 
 
 def figure(results: Results) -> Figure | None:
-    """Each parameter, iterate by iterate, with each model."""
+    """Iterates of each parameter, for each model."""
     from mvest.reporting.figures import iterates_figure
 
     return iterates_figure(results.first.estimates)

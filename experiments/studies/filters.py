@@ -1,4 +1,4 @@
-"""All filters on the same problems, compared with draws from the posterior."""
+"""Runs all filters on the same problems and compares them with draws from the posterior."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ TRANSFORM = Log()
 """All unknowns are positive."""
 
 TARGET = 0.1
-"""Largest relative difference of an interval's width from that of the reference."""
+"""Largest relative difference between an interval's width and the reference's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterProblem:
-    """One problem on which filters are compared; unknowns are normal in their logarithms."""
+    """One problem on which filters are compared; the unknowns' logarithms are normal."""
 
     parameters: tuple[str, ...]
     truth: tuple[Value, ...]
@@ -54,7 +54,7 @@ class FilterStudySettings:
     """All filters on the same problems."""
 
     problems: dict[str, FilterProblem] = field(default_factory=dict)
-    # _target_ and settings of each filter; a Q of `prior` is the prior's covariance.
+    # _target_ and settings of each filter; Q `prior` means the prior's covariance.
     methods: dict[str, dict[str, Any]] = field(default_factory=dict)
     # The filter that draws from the posterior; the others are compared with it.
     reference: dict[str, Any] = field(default_factory=dict)
@@ -62,13 +62,13 @@ class FilterStudySettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     filters: FilterStudySettings
 
 
 def run(job: Job[Settings]) -> Result:
-    """Every filter on every problem.
+    """Run every filter on every problem.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def run(job: Job[Settings]) -> Result:
     for name, about in settings.problems.items():
         problem = build_problem(job.values, name, about)
         mesh = mesh or Mesh.of(problem.closure.mesh)
-        # All are built before any is run, so that a wrong setting is refused at once.
+        # All are built before any runs, so that a wrong setting raises an error at once.
         filters = {method: problem.filter(values) for method, values in settings.methods.items()}
         reference = problem.estimate(filter_of(settings.reference), seed)
         if reference.transformed_samples is None:
@@ -117,12 +117,12 @@ COLUMNS: dict[str, Column | str] = {
     "check limit": "",
     "ended": Column(hidden=True),
 }
-"""Widths and ends of 95 % intervals are of logarithms, relative to the width of the reference."""
+"""Widths and ends of 95 % intervals of logarithms, relative to the reference's width."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Parameters to be estimated from one observation of the closed frame."""
+    """Parameters to estimate from one observation of the closed frame."""
 
     name: str
     about: FilterProblem
@@ -131,7 +131,7 @@ class Problem:
     prior: Gaussian
 
     def filter(self, method: Values) -> Filter:
-        """A configured filter; a Q of ``prior`` is the prior's covariance."""
+        """A configured filter; Q ``prior`` means the prior's covariance."""
         own = {"Q": self.prior.covariance.tolist()} if method.get("Q") == "prior" else {}
         return filter_of({**method, **own})
 
@@ -154,7 +154,7 @@ class Problem:
             return filter_(self.model, self.prior, y, R, **how)
 
     def rows(self, method: str, found: Estimate, reference: Estimate) -> list[dict[str, Any]]:
-        """A row for each unknown, its interval relative to that of the reference."""
+        """A row for each unknown, with its interval relative to the reference's."""
         ends, own = np.log(reference.interval()), np.log(found.interval())
         off, check = (own - ends) / (ends[1] - ends[0]), found.check
         whole = {"problem": self.name, "filter": method, "runs": found.forward_solves}
@@ -181,7 +181,7 @@ class Problem:
 
 
 def build_problem(config: Values, name: str, about: FilterProblem) -> Problem:
-    """A configured problem; a MvestError if a setting is inadmissible."""
+    """A configured problem; raises a MvestError if a setting is inadmissible."""
     mean, spread = np.array(about.initial), np.array(about.log_std)
     if mean.shape != (len(about.parameters),) or spread.shape != mean.shape:
         raise ConfigurationError(
@@ -209,7 +209,7 @@ def build_problem(config: Values, name: str, about: FilterProblem) -> Problem:
 
 
 def figure(results: Results) -> Figure:
-    """The 95 % intervals of each filter over those of the reference."""
+    """The 95 % intervals of each filter relative to those of the reference."""
     from textwrap import fill
 
     from mvest.reporting.figures import BAD, GOOD, SMALL, headline, panels
@@ -220,7 +220,7 @@ def figure(results: Results) -> Figure:
     for axes, by in zip(grid[0], references, strict=True):
 
         def in_std(row: Values, *names: str, by: Values = by) -> list[float]:
-            """Logarithms as deviations from the reference's mean in its standard deviations."""
+            """Logarithms as deviations from the reference's mean, in its standard deviations."""
             return [(np.log(row[name]) - by["log mean"]) / by["log std"] for name in names]
 
         axes.axvspan(*in_std(by, "low", "high"), color="0.88")

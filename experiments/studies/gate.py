@@ -1,7 +1,7 @@
-"""Closures of a valve, and tests whether its closed state is unique.
+"""Closes a valve and tests whether its closed state is unique.
 
 The gate closes an anatomy under variations that must not matter, and follows it along its moduli
-(`mvest.closure.robustness`). With ``gate.every_step`` one closure is measured step by step instead.
+(`mvest.closure.robustness`). With ``gate.every_step`` it measures one closure step by step instead.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateSettings:
-    """Which test is run."""
+    """Selects the test."""
 
     every_step: bool = False  # measure one closure step by step, without the gate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     gate: GateSettings = field(default_factory=GateSettings)
 
@@ -58,7 +58,7 @@ def _gate(job: Job[Settings]) -> Result:
     verdict = {"passed": report.passed, "closures": closures}
     return Result(
         tables={"": table([verdict], passed=""), "variations": gate_rows(report)},
-        # Other studies look the verdict up by these.
+        # Other studies find the verdict by these.
         numbers={"anatomy": anatomy_digest(values), "passed": report.passed},
         status="converged" if reference.passed else "failed",
         reason="completed" if reference.passed else reference.reason,
@@ -86,7 +86,7 @@ def _closing(job: Job[Settings]) -> Result:
 
 
 def summary(results: Results) -> dict[str, Table]:
-    """The verdicts and the largest distance of each variation by anatomy, or the steps."""
+    """Verdicts and largest distance of each variation by anatomy, or the steps."""
     parts = {record.row: record.table_of() for record in results.records.values()}
     if "variations" not in results.table_names:
         return {"": results.table()}
@@ -101,7 +101,7 @@ def summary(results: Results) -> dict[str, Table]:
 
 
 MOMENTS = (0.75, 0.1)
-"""Shares of the open orifice at which a closing valve is drawn, besides the first and last step."""
+"""Fractions of the open orifice at which a closing valve is drawn, plus first and last step."""
 
 CURVES = {
     "orifice": "orifice (mm²)",
@@ -138,14 +138,14 @@ def figure(results: Results) -> Figure | None:
 
 
 def _moments(orifice: FloatArray) -> list[int]:
-    """Open, half open, nearly closed and last step; the last one if a share is not reached."""
+    """First, half-open, nearly closed and last step; the last step if a fraction is not reached."""
     share, last = orifice / max(float(orifice[0]), 1e-9), len(orifice) - 1
     reached = [int(np.append(np.flatnonzero(share < level), last)[0]) for level in MOMENTS]
     return [0, *reached, last]
 
 
 def _draw_curves(part: Any, values: Mapping[str, Any], moments: list[int], at_rest: bool) -> None:
-    """Measures over time with the drawn moments; the equilibrium has no time and is drawn apart."""
+    """Measures over time with the drawn moments; the timeless equilibrium is drawn separately."""
     from mvest.reporting.figures import COLOURS, plain_axes
 
     time = np.array(values["time"], dtype=float)

@@ -1,8 +1,8 @@
-"""Virtual patients in simulated volumes: blind estimates, compared with the truth.
+"""Images virtual patients in simulated volumes; compares blind estimates with the truth.
 
-A separate process goes from the file of a volume to the moduli. Two others start from better
-geometries: the true one (known geometry), and the true one with the error of a voxel (perfect
-segmentation). The errors that remain there are not caused by the images.
+A separate process estimates the moduli from the volume file. Two more start from better geometries:
+the true geometry (known geometry), and the true geometry with the error of a voxel (perfect
+segmentation). Errors that remain in these two are not caused by the images.
 """
 
 from __future__ import annotations
@@ -66,29 +66,29 @@ Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
 """A patient, its imaging, and the number of anatomies drawn for it."""
 
 VOLUME, HIDDEN, TRUTH, REVEALED = "volume.seq.nrrd", "hidden", "hidden/truth", "hidden.json"
-"""In the folder of a patient: the file for the estimator; the folder that it cannot open, with the
-cases of better geometries; the folder that no estimation can open; and the file of the truth."""
+"""In a patient's folder: the estimator's input file; the folder with the better geometries, which
+that process cannot open; the folder that no estimation can open; and the truth file."""
 
 KNOWN, SEGMENTED = "known", "segmented"
 """Folders of the better geometries, and names of their estimates in a record."""
 SOURCES = {"": "the volume", SEGMENTED: "a perfect segmentation", KNOWN: "the known geometry"}
 
 MAX_DRAWS = 10
-"""Anatomies are drawn until one closes as a valve, but not more than this."""
+"""Largest number of anatomies drawn to find one that closes as a valve."""
 
 KNOWN_UNCERTAINTY = {"std_mm": 0.5, "correlation_length_mm": 10.0}
 """Stated errors of the true positions, similar to those of the image step."""
 
 VOXELS_CORRELATED = 10.0
-"""Correlation length of errors of a segmentation in voxels: surfaces of label maps are smoothed."""
+"""Correlation length (voxels) of segmentation errors: surfaces of label maps are smoothed."""
 
 SAMPLES = 100
-"""Samples of the errors of a segmentation in its case."""
+"""Number of error samples in the case of a segmentation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     patient: PatientSettings
     volume: str | None = None  # written by the study
@@ -135,7 +135,7 @@ def _numbers_if_converged(record: EstimateRecord) -> EstimateRecord:
 
 # -- the patient ----------------------------------------------------------------------------------
 def make_imaged_patient(values: Values, patient: PatientSettings) -> Path:
-    """The folder of the configured patient, which is simulated and imaged once."""
+    """The folder of the configured patient; simulates and images the patient once."""
     about = ("name", "description", "moduli", "moduli_spread", "variation", "deviations")
     described = {
         "patient": {key: values["patient"][key] for key in about},
@@ -176,7 +176,7 @@ def _simulate(values: Values, patient: PatientSettings) -> Made:
 def _write(place: Path, imaged: Made, patient: PatientSettings, described: Values) -> None:
     made, probe, volume, draws = imaged
     (place / TRUTH).mkdir(parents=True)
-    # The source of a simulated volume names the patient; a file has only its own name.
+    # A simulated volume's source names the patient; the file must not.
     write_sequence_nrrd(place / VOLUME, volume)
     frames = CaseFrames(0, made.closed, made.pressure_mmHg)
     true = true_sequence(made.valve, probe)
@@ -210,7 +210,7 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
 def _segmented(
     true: ValveSequence, frames: CaseFrames, voxel_mm: float, seed: int
 ) -> tuple[ValveSequence, ErrorSamples]:
-    """The true positions with the rounding error of a voxel, and samples of this error.
+    """The true positions with a voxel's rounding error, and samples of this error.
 
     Errors of open frame, closed frame and tips are independent.
     """
@@ -253,7 +253,7 @@ def summary(results: Results) -> dict[str, Table]:
 
 
 def _by_source(results: Results, *, verdict_of_volume: bool = False) -> Groups:
-    """Estimates by source, each with its own verdict or with that of the volume's estimate."""
+    """Estimates by source, each with its own verdict or the verdict on the volume's estimate."""
     return grouped(
         (source, estimate, own if verdict_of_volume else estimate)
         for _, own in revealed(results)
@@ -263,7 +263,7 @@ def _by_source(results: Results, *, verdict_of_volume: bool = False) -> Groups:
 
 
 def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
-    """A row for each patient and modulus, with signed errors."""
+    """A row per patient and modulus, with signed errors."""
     rows = []
     for estimate in estimates:
         for own in estimate.moduli:
@@ -280,7 +280,7 @@ def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
 
 
 def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
-    """Mean error of each modulus's logarithm, and its slope over the truth's, if converged."""
+    """Mean error of each modulus's logarithm, and its slope against the truth, if converged."""
     rows = []
     for source, moduli in groups.items():
         known = [(own.truth, own.estimate) for own in moduli if own.estimate is not None]
@@ -300,9 +300,9 @@ def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
 
 
 def _chordae(results: Results) -> Table:
-    """True rest length of chordae over the distance of their ends in the closed valve, by family.
+    """True chordal rest length over the distance between the ends when closed, by family.
 
-    ``laid out`` is the ratio that estimators assume.
+    ``laid out`` is the ratio that the estimators assume.
     """
     laid_out = {"marginal": SEEN_CLOSURE.marginal_slack, "basal": SEEN_CLOSURE.basal_slack}
     if "chordae" not in results.table_names:

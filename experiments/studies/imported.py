@@ -1,7 +1,7 @@
-"""Imported valves: closures, gates and estimates.
+"""Closures, gate runs and estimates of imported valves.
 
-A recorded closure (``donor``) is fitted to its closed frame from several starts. The shape of a
-reference heart (``heart``) is meshed and closed, and known moduli are estimated on it. The data are
+The study fits a recorded closure (``donor``) to its closed frame from several starts. It meshes and
+closes the shape of a reference heart (``heart``), and estimates known moduli on it. The data are
 not part of this project; ``conf/experiment`` names their sources.
 """
 
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 
 def recording_folder(recording: str | None, case: str) -> Path:
-    """The folder of a case in a checkout of a donor's data; an InputError if there is none."""
+    """A case folder in a checkout of a donor's data; raises an InputError if there is none."""
     folder = Path(recording or "") / case
     if not recording or not folder.is_dir():
         raise InputError(
@@ -79,23 +79,23 @@ def _recording(value: str | None, other: Values) -> Any:
 
 
 LARGEST_CHANGE = 0.15
-"""Of a modulus's logarithm between closed states."""
+"""Largest change of a modulus's logarithm between closed states."""
 
 WHERE_FROM = "the data are not part of this package, for where to get them see conf/experiment"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DonorSettings:
-    """A recorded closure; names of sets are those of its input deck."""
+    """A recorded closure; set names are those of its input deck."""
 
     # Checkout of the data.
     recording: Annotated[str | None, Reads(_recording)] = None
-    case: str = ""  # its folder, which names its deck and frames; empty: no donor
+    case: str = ""  # its folder; deck and frames have the same name; empty: no donor
     citation: str = ""  # of the data
     leaflets: dict[str, str] = field(default_factory=dict)  # name of a leaflet -> element set
     annulus: str = ""  # node set
     free_edge: str = ""  # node set
-    # Of the meshed and observed midsurface, and of that for contact.
+    # For the meshed and observed midsurface, and for the contact midsurface.
     vertices: Count = 430
     contact_vertices: Count = 3000
     starts: tuple[Any, ...] = ()  # MPa, moduli at the start of each fit
@@ -103,31 +103,31 @@ class DonorSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeartSettings:
-    """A static shape of a thick valve with two papillary muscles, and its twins.
+    """A static shape of a thick valve with two papillary muscles, and twins of it.
 
-    Files, names and units are options of `mvest.exchange.importing.leaflets`.
+    Files, names and units are passed to `mvest.exchange.importing.leaflets`.
     """
 
     source: InputFile = None  # closed surface of both leaflets
-    leaflets: str | None = None  # object in it, if there are others
+    leaflets: str | None = None  # their object in it, if there are others
     # Papillary muscles, antero-lateral and postero-medial: files, or objects of the source.
     muscles: Annotated[tuple[str, ...], Reads(contents)] = ()
     units: str = "mm"
     name: str = "imported valve"
     citation: str = ""
     smoothing_mm: Length = 4.0  # removes spikes that are sharper than leaflets are thick
-    # Bounds of the thickness, since some parts are no leaflet.
+    # Bounds of the thickness, because some parts are not leaflet.
     min_thickness_mm: Thickness = 0.3
     max_thickness_mm: Thickness = 3.0
-    # Depth of the free edges below the annulus, closed over open, which sets lengths of chordae.
+    # Depth of the free edges below the annulus, closed over open; sets the chordal lengths.
     closed_depth: Share = 0.5
-    # Twin -> settings of truth that differ from the estimator's model.
+    # Twin -> settings of the truth that differ from the estimator's model.
     twins: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     donor: DonorSettings = field(default_factory=DonorSettings)
     heart: HeartSettings = field(default_factory=HeartSettings)
@@ -139,14 +139,14 @@ def run(job: Job[Settings]) -> Result:
     Raises
     ------
     MvestError
-        If the data are absent (the message names their source) or a setting is inadmissible.
+        If the data are missing (the message names their source) or a setting is inadmissible.
     """
     return _donor(job) if job.settings.donor.case else _heart(job)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """A recorded valve, ready to be closed; ``coarse`` is the meshed and observed midsurface."""
+    """A recorded valve, ready to close; ``coarse`` is the meshed and observed midsurface."""
 
     recording: Recording
     coarse: Valve
@@ -161,9 +161,9 @@ class Recorded:
         return ClosureModel(*valves, self.mesh, self.settings, parameters, **settings)
 
     def distances(self, closed: FloatArray | None) -> dict[str, float | None]:
-        """Distances (mm) of closed positions ``(n, 3)`` from the recorded ones.
+        """Distances (mm) between closed positions ``(n, 3)`` and the recorded positions.
 
-        ``surface`` is the mean distance between the whole surfaces, in both directions.
+        ``surface`` is the mean distance between the full surfaces, in both directions.
         """
         if closed is None:
             return dict.fromkeys(DISTANCES)
@@ -182,7 +182,7 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
     Raises
     ------
     MvestError
-        If the data are absent or a setting is inadmissible.
+        If the data are missing or a setting is inadmissible.
     """
     names = donor.leaflets, donor.annulus, donor.free_edge
     recording = read_recording(recording_folder(donor.recording, donor.case), *names)
@@ -193,7 +193,7 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
             f"mechanics.protocol.pressure_mmHg = {protocol.pressure_mmHg}: the recording has the "
             "pressure and its rise; expected 0, without a curve"
         )
-    # The pressure may rise differently from the motion.
+    # Pressure and motion may rise differently.
     shares, times = recording.pressure_share, recording.times / recording.times[-1] * protocol.ramp
     together = np.allclose(shares, recording.valve.motion.phase, rtol=0, atol=1e-12)
     curve = () if together else tuple(zip(times.tolist(), shares.tolist(), strict=True))
@@ -232,7 +232,7 @@ def _donor(job: Job[Settings]) -> Result:
     with SolveBar("donor", steps, TYPICAL_SOLVES * len(starts), parameters) as bar:
         first = valve.model(parameters, repeat=False, **how)
         first.on_step = bar.step
-        # A start differs by the rounding of its logarithm.
+        # A start may differ by the rounding error of its logarithm.
         known = Remembered(first, rtol=1e-12)
         generic: Prediction = known(prior.mean)
         if generic.converged:
@@ -284,12 +284,12 @@ def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]
 
 
 def import_heart(heart: HeartSettings) -> ValveCase:
-    """The valve as a case of its open frame.
+    """Make a case of the valve's open frame.
 
     Raises
     ------
     InputError, GeometryError
-        A part is missing, or is not part of a thick valve with two muscles.
+        A part is missing, or does not fit a thick valve with two muscles.
     """
     for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
         if file is None or not Path(file).is_file():
@@ -351,14 +351,14 @@ def _heart(job: Job[Settings]) -> Result:
 
 
 def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:
-    """Moduli from one simulated observation."""
+    """Estimate moduli from one simulated observation."""
     twin = build_twin({**values, "truth": {**values["truth"], **changes}})
     (found,) = estimate_twin(twin, [values["seed"]], name)
     return record_of(found, seed=values["seed"], case=name, simulated=True)
 
 
 def figure(results: Results) -> Figure | None:
-    """The closed donor valve with generic and fitted moduli, or the open and closed heart valve."""
+    """The closed donor valve with generic and fitted moduli, or the heart valve open and closed."""
     from matplotlib.figure import Figure
 
     from mvest.reporting.case.figures import case_figure

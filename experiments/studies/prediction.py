@@ -1,8 +1,8 @@
-"""Predictions of an estimated valve under other conditions, compared with the truth.
+"""Predicts an estimated valve under other conditions and compares it with the truth.
 
-Simulated patients with one leaking anatomy are observed closed, with errors, on another mesh. Their
-parameters are estimated, and scenarios are predicted at the estimate and at samples of its
-posterior. Then the same scenarios are computed with the true parameters.
+The simulated patients share one leaking anatomy. Their closed valves are simulated on another mesh
+and observed with errors. The study estimates the parameters and predicts scenarios at the estimate
+and at posterior samples, then computes the same scenarios with the true parameters.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 Row = Mapping[str, Any]
 
 MEASURED_ON = (96, 22)
-"""Vertices around and along the leaflets of the surface for measurements."""
+"""Vertices around and along the leaflets of the surface used for measurements."""
 
 Compared = tuple[PredictedScenario, Sample, Sample]
 """A prediction, and the true valve on its own and on the estimator's mesh."""
@@ -76,7 +76,7 @@ KINDS = {
     "without_mesh_error": ("low", "high", "truth_own_mesh", "inside_own_mesh"),
     "same_mesh": ("low", "high", "truth_same_mesh", "inside_same_mesh"),
 }
-"""Kinds of intervals -> columns of the ends, of the truth, and of whether the truth is inside."""
+"""Kinds of intervals -> columns for the ends, the truth, and whether it is inside."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,18 +84,18 @@ class PredictionSettings:
     """Scenarios, samples and simulated patients."""
 
     scenarios: dict[str, Scenario] = field(default_factory=dict)
-    samples: Count = 32  # of the first patient's posterior; a power of two
+    samples: Count = 32  # from the first patient's posterior; a power of two
     # Simulated, with the seeds seed, seed + 1, ...
     patients: Repeats = 1
-    further_samples: Count = 8  # of the posterior of every other patient
+    further_samples: Count = 8  # from every other patient's posterior
     spread: tuple[Logarithm, ...] = ()  # SD of the logarithms of true parameters
-    # Cells of a finer mesh for the error of the mesh, which intervals include unless this is empty.
+    # Cells of a finer mesh for the mesh error; empty: intervals exclude the mesh error.
     check_mesh: tuple[AxisCount, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     prediction: PredictionSettings = field(default_factory=PredictionSettings)
 
@@ -118,7 +118,7 @@ def run_prediction(job: Job[Settings]) -> Result:
     spread, parameters = np.array(settings.spread), tuple(config["parameters"])
     require_one_each("prediction.spread", spread, parameters)
     twin = build_twin(config)
-    # Measured on more points than are observed, since correlated errors of points cost time.
+    # Measured on more points than are observed: correlated errors of many points are slow.
     valve = anatomy_of(config).valve(*MEASURED_ON)
     usual = replace(twin.model, valve=valve)
     finer = None
@@ -182,7 +182,7 @@ def _patient(
     settings: PredictionSettings,
     step: Callable[[], None],
 ) -> tuple[StudyResult, dict[str, Compared]]:
-    """One simulated patient: the estimate, and predictions by the title of the scenario."""
+    """One simulated patient: the estimate, and predictions by scenario title."""
     rng = np.random.default_rng(seed)
     spread = np.array(settings.spread, dtype=float)
     truth = np.asarray(twin.truth_values * np.exp(spread * rng.standard_normal(len(spread))))
@@ -190,7 +190,7 @@ def _patient(
     step()
     if data.observation is None:
         return StudyResult.failed(twin.problem, data.reason), {}
-    # From the open valve, so that patients do not depend on each other.
+    # Start from the open valve, so that patients do not depend on each other.
     twin.model.restart(None)
     steps = len(twin.model.settings.protocol.steps())
     with SolveBar(f"patient {seed}", steps, TYPICAL_SOLVES, twin.problem.parameters) as bar:
@@ -217,7 +217,7 @@ def _patient(
 
 
 def _fields(valve: Valve, compared: Mapping[str, Compared]) -> dict[str, NDArray[Any]]:
-    """Closed shapes at the estimate as fields of a case; NaN if a valve did not close."""
+    """Closed shapes at the estimate, as case fields; NaN if a valve did not close."""
     blank = np.full(valve.surface.vertices.shape, np.nan)
     shapes = [blank if found.shape is None else found.shape for found, *_ in compared.values()]
     return valve_fields(valve, list(compared)) | {"fitted": np.stack(shapes).astype(np.float32)}
@@ -227,7 +227,7 @@ def _fields(valve: Valve, compared: Mapping[str, Compared]) -> dict[str, NDArray
 def first_patient_table(rows: Sequence[Row]) -> Table:
     """Measures of the first patient by condition, with 95 % intervals.
 
-    The intervals include the error of the mesh if it is known.
+    The intervals include the mesh error if it is known.
     """
     cells: dict[str, dict[str, Any]] = {}
     columns: dict[str, Column] = {"measure": Column()}
@@ -246,7 +246,7 @@ def first_patient_table(rows: Sequence[Row]) -> Table:
 
 
 def coverage_table(rows: Sequence[Row]) -> Table:
-    """Numbers of intervals that contain the truth, of all patients and conditions, by measure.
+    """Number of intervals that contain the truth, by measure, over all patients and conditions.
 
     An interval without width at the truth (no gap at all) has no uncertainty and is not counted.
     """
@@ -266,7 +266,7 @@ def coverage_table(rows: Sequence[Row]) -> Table:
 
 
 def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]) -> Iterator[Row]:
-    """Valves that were not estimated or did not close, with the reasons."""
+    """Valves that could not be estimated or did not close, with the reasons."""
     for seed, (result, compared) in patients.items():
         whole: dict[str, Any] = {"patient": seed, "scenario": "", "valve": "estimate", "count": 1}
         if not compared:
@@ -285,8 +285,8 @@ def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]
 def figure(results: Results) -> Figure | None:
     """The first patient's closed valve by condition from the atrium, and its measures.
 
-    Touching midsurfaces are a thickness apart: the slit between them is drawn as tissue, and gaps
-    in the colour of blood. None without a prediction.
+    Touching midsurfaces are one thickness apart, so the slit between them is drawn as tissue. Gaps
+    have the colour of blood. Returns None without a prediction.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch

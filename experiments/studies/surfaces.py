@@ -1,8 +1,8 @@
-"""Virtual patients whose geometry comes from files of other programs.
+"""Virtual patients whose geometry comes from files in other programs' formats.
 
 The valve of a virtual patient is exported (as surfaces, a SlicerHeart folder or label maps),
-imported, and estimated like any own valve. The exports use no reader or writer of this project: VTK
-(through PyVista) cuts and writes surfaces, pandas writes tables, and nibabel label maps.
+imported, and estimated like a user's valve. The exports use no reader or writer of this project:
+VTK (through PyVista) cuts and writes surfaces, pandas writes tables, and nibabel writes label maps.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mvest.valve.geometry.proximity import closest_points
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     patient: PatientSettings
     personal: PersonalSettings
@@ -49,12 +49,12 @@ class Settings:
 
 # -- run ------------------------------------------------------------------------------------------
 def run_surfaces(job: Job[Settings]) -> Result:
-    """Simulate, export, import, estimate in another process, then reveal the truth."""
+    """Simulate, export, import, estimate in a separate process, then reveal the truth."""
     arrival, folder = job.settings.arrival, job.folder
     place = make_patient(job.values, job.settings.patient)
     hidden, positions = place.truth()
     patient = read_case(place.case)
-    for name in ("arrival", "case"):  # of an earlier run
+    for name in ("arrival", "case"):  # from an earlier run
         shutil.rmtree(folder / name, ignore_errors=True)
     (folder / "arrival").mkdir()
     registration = np.array([hidden["values"][name] for name in REGISTRATION])
@@ -65,7 +65,7 @@ def run_surfaces(job: Job[Settings]) -> Result:
     for role, true in (("open", arrived.opened), ("closed", arrived.closed)):
         numbers[f"{role}_back_mm"] = surface_error(arrived.case.frame(true.role), true)
     numbers["thickness_mean_mm"] = thickness_error(arrived, patient.surface.thickness)
-    # Displacements of the patient's case are not in the imported one.
+    # The imported case lacks the displacements of the patient's case.
     truth = {name: hidden["values"][name] for name in hidden["values"] if name.startswith("E_f.")}
     about = {"case": patient.name, "seed": job.values["seed"]}
     (estimate,) = (one.model_copy(update=about).with_truth(truth) for one in found.estimates)
@@ -73,13 +73,13 @@ def run_surfaces(job: Job[Settings]) -> Result:
 
 
 def surface_error(found: Frame, true: Frame) -> float:
-    """Root mean square distance (mm) of the true midsurface's vertices from another surface."""
+    """Root mean square distance (mm) from the true midsurface's vertices to another surface."""
     distance = closest_points(true.vertices, found.vertices, found.triangles).distance
     return float(np.sqrt(np.mean(np.square(distance))))
 
 
 def thickness_error(arrived: Arrived, thickness_mm: FloatArray) -> float:
-    """Mean error (mm) of the thickness, from ``thickness_mm (n,)`` at the true frame's vertices."""
+    """Mean thickness error (mm), given ``thickness_mm (n,)`` at the true frame's vertices."""
     surface, true = arrived.case.surface, arrived.opened
     nearest = closest_points(surface.vertices, true.vertices, true.triangles)
     return float(np.mean(surface.thickness - nearest.interpolate(thickness_mm, true.triangles)))
@@ -112,7 +112,7 @@ def summary(results: Results) -> dict[str, Table]:
 
 
 OFF = ("open_back", "closed_back", "thickness_mean")
-"""Errors of geometries in mm, by their names in a record."""
+"""Geometric errors (mm), by their names in a record."""
 
 
 def _runs(results: Results) -> list[tuple[Record, EstimateRecord]]:

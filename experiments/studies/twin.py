@@ -1,4 +1,4 @@
-"""A synthetic study: simulate an observation, estimate from it, compare with the truth."""
+"""Simulates an observation, estimates from it, and compares with the truth."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ LOCKING = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration: nothing."""
+    """The study adds no settings to the configuration."""
 
 
 def run_twin(job: Job[Settings]) -> Result:
-    """Simulate an observation for each seed and estimate from it; arrays are of the first."""
+    """Simulate an observation per seed and estimate from it; arrays come from the first."""
     values = job.values
     twin = build_twin(values)
     if twin.model.mesh.element_type == "tet4":
@@ -52,7 +52,7 @@ def run_twin(job: Job[Settings]) -> Result:
     solves = estimates[0].forward_solves or 0
     band, found = None, None if result.filtered is None else result.filtered.prediction
     if isinstance(twin.source, Extrapolated) and found is not None:
-        # Change of the least-squares estimate by the extrapolation of the truth.
+        # Change of the least-squares estimate due to extrapolating the truth.
         correction = twin.source.correction(twin.truth_values)
         shift = np.linalg.lstsq(found.jacobian, correction)[0]
         band = list(100 * np.abs(shift / twin.truth_values))
@@ -72,7 +72,7 @@ def run_twin(job: Job[Settings]) -> Result:
 
 
 def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
-    """The last observed and fitted frame, as fields of a case (`mvest.problem.fields`)."""
+    """The last observed and fitted frames, as case fields (`mvest.problem.fields`)."""
     assert isinstance(result.observation, Observation)
     assert result.fitted is not None
     return {
@@ -93,7 +93,7 @@ def require_twin(values: Mapping[str, Any]) -> None:
 def _row(
     values: Mapping[str, Any], record: EstimateRecord, band: Sequence[float] | None
 ) -> dict[str, Any]:
-    """The row of a run in tables; errors have no sign."""
+    """The table row of a run; errors are absolute."""
     row: dict[str, Any] = {"run": values["row"], "source": "mvest"}
     for k, name in enumerate(values["parameters"]):
         own = record.unknown(name)
@@ -138,7 +138,7 @@ def _paper_row(values: Mapping[str, Any], record: EstimateRecord) -> dict[str, A
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Rows of runs, with the meaning of their columns."""
+    """A table of runs, with the meaning of its columns."""
     about: dict[str, Column] = {"run": Column()}
     for name in (key.partition(" ")[2] for key in rows[0] if key.startswith("estimate ")):
         unit, std, band = unit_of(name), f"std {name}", f"truth of {name} known to"
@@ -160,7 +160,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def summary(results: Results) -> dict[str, Table]:
-    """The paper's row, and a row for each run, failed ones included."""
+    """The paper's row, and a row for each run, including failed runs."""
     whole = results.table()
     paper = [row for row in whole.rows if row["source"] == "paper"][:1]
     rows = [row for row in whole.rows if row["source"] != "paper"]

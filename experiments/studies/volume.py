@@ -1,4 +1,4 @@
-"""Your own volume over time: from images to moduli with intervals."""
+"""Estimates moduli with intervals from your own volume over time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from experiments.common.study import Job, Result, Study
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     volume: VolumeInput = None  # file of a volume over time
     imaged: ImagedInput = field(default_factory=ImagedInput)

@@ -1,1 +1,1 @@
-"""The joint of valve and mechanics: parameters in, the moving and the closed valve out."""
+"""Combines valve and mechanics: parameters in, the moving and the closed valve out."""

@@ -1,4 +1,4 @@
-"""From which closed state a closure may be continued, and how far.
+"""Decides from which closed state a closure may be continued, and how far.
 
 Distances are measured in coordinates in which closed states change evenly: the logarithms of the
 parameters.
@@ -16,7 +16,7 @@ from mvest.typing import FloatArray
 
 STIFFENED = 0.5
 """Factor on log(1 + stiffening). Five steps of 0.2 then lead from tissue that hardly stiffens to
-nearly exponential tissue, and a leaflet moves no farther in a step than with its modulus."""
+nearly exponential tissue. A leaflet moves no farther per step than per step of its modulus."""
 
 
 SPACING = 0.4
@@ -36,9 +36,9 @@ class ClosedState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coordinates:
-    """Logarithms of positive parameters; coefficients of a field times its deviation of log E_f.
+    """Logarithms of positive parameters; a field's coefficients times its deviation of log E_f.
 
-    A stiffening alpha counts as a share of log(1 + alpha), which is finite without stiffening.
+    A stiffening alpha becomes a fraction of log(1 + alpha), which is finite without stiffening.
     """
 
     units: FloatArray  #: (p,), change of log E_f per coefficient of a field; factor on a logarithm
@@ -58,7 +58,7 @@ class Coordinates:
         return cls(np.array(units), np.array(offsets))
 
     def __call__(self, m: FloatArray) -> FloatArray:
-        """Coordinates ``(p,)`` of parameters ``(p,)``; infinite or NaN if it has no logarithm."""
+        """Coordinates ``(p,)`` of parameters ``(p,)``; infinite or NaN without a logarithm."""
         positive = ~np.isnan(self.offsets)
         with np.errstate(divide="ignore", invalid="ignore"):
             return self.units * np.where(
@@ -71,7 +71,7 @@ class Coordinates:
         return np.where(positive, np.exp(np.where(positive, own, 0.0)) - self.offsets, own)
 
     def rounded(self, m: FloatArray) -> FloatArray:
-        """Parameters ``(p,)`` at the nearest point of a lattice."""
+        """Parameters ``(p,)`` at the nearest lattice point."""
         return self.parameters(np.round(self(m) / SPACING) * SPACING)
 
     def distance(self, start: FloatArray, end: FloatArray) -> float:
@@ -80,7 +80,7 @@ class Coordinates:
         return float(largest) if np.isfinite(largest) else np.inf
 
     def between(self, start: FloatArray, end: FloatArray, largest: float) -> list[FloatArray]:
-        """Intermediate parameters, so that no coordinate changes by more than ``largest``."""
+        """Intermediate parameters, such that no coordinate changes by more than ``largest``."""
         distance = self.distance(start, end)
         n = int(np.ceil(distance / largest)) if np.isfinite(distance) else 0
         one, other = self(start), self(end)

@@ -1,8 +1,8 @@
-"""A valve over a whole cycle, open to closed and back: all observed frames and their derivative.
+"""A valve over a whole cycle, open to closed and back: the observed frames and their derivatives.
 
-The state of the valve (positions, velocities, strains with their history) follows from the
-parameters through the dynamics and is not estimated. With new parameters the whole cycle is run
-again, so that parameters and state are consistent in every frame.
+The dynamics determine the valve's state (positions, velocities, strain history) from the
+parameters, so the state is not estimated. New parameters require a new run of the whole cycle, so
+that parameters and state are consistent in every frame.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mvest.quantities import BeatTime, Pressure, TimeStep
 from mvest.typing import FloatArray
 
 DEFAULT_TIMES = tuple(round(0.05 * k, 2) for k in range(21))
-"""s, from the open valve until it opens again."""
+"""s, from the open valve until it reopens."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +43,13 @@ class CycleProtocol:
     pressure_mmHg : float
         Transmitral, on the plateau.
     rise, hold, fall : float
-        s, of the three parts.
+        s, durations of the three parts.
     dt : float
-        s, largest time step; the time between two frames is divided evenly. Leaflets flip within
-        some milliseconds. If a step skips that, frames jump with the parameters
-        (`experiment=cycle` measures it).
+        s, largest time step; the time between two frames is divided evenly. Leaflets flip within a
+        few milliseconds. If a step is longer, frames jump as parameters change (measured by
+        `experiment=cycle`).
     times : tuple of float
-        s of the observed frames, strictly increasing from >= 0; the run ends at the last.
+        s, times of the observed frames, strictly increasing from >= 0; the run ends at the last.
     """
 
     pressure_mmHg: Pressure = 120.0
@@ -101,7 +101,7 @@ class CycleProtocol:
         return tuple(np.cumsum(self._steps_between()).tolist())
 
     def frame_sets(self) -> dict[str, list[int]]:
-        """Sets of observed frames by name: increasing numbers, and parts of the cycle.
+        """Named sets of observed frames: increasing numbers of frames, and parts of the cycle.
 
         Raises
         ------
@@ -128,7 +128,7 @@ class CycleProtocol:
         return {name: frames for name, frames in sets.items() if frames}
 
     def _steps_between(self) -> list[int]:
-        # Rounding of a gap that is a multiple of dt must not add a step.
+        # If a gap is a multiple of dt, rounding must not add a step.
         gaps = np.diff([0.0, *self.times]) / self.dt
         return np.ceil(gaps * (1 - 1e-9)).astype(int).tolist()
 
@@ -137,7 +137,7 @@ class CycleProtocol:
 class CycleModel:
     """Predicted positions of the observed vertices in every frame of a cycle."""
 
-    #: valve, mesh, mechanics and names of the parameters; its own protocol is not used
+    #: valve, mesh, mechanics and parameter names; its own protocol is not used
     closure: ClosureModel
     protocol: CycleProtocol
 
@@ -149,7 +149,7 @@ class CycleModel:
     def run(self, m: FloatArray, *, sensitivities: bool = True) -> Simulation:
         """Run the cycle with parameters ``m (p,)`` from the open valve at rest.
 
-        All frames are differentiated with ``sensitivities``. Raises MaterialError if a modulus is
+        With ``sensitivities``, all frames are differentiated. Raises MaterialError if a modulus is
         inadmissible.
         """
         own, (system, parameters) = self.closure, self.closure.tuned(m)
@@ -180,13 +180,13 @@ class CycleModel:
         return self._observed(simulation.frames)
 
     def _observed(self, steps: FloatArray) -> FloatArray:
-        """Observed vertices ``(f, n, 3)`` in the observed frames, from nodal values of steps."""
+        """Observed vertices ``(f, n, 3)`` in the observed frames, from the steps' nodal values."""
         return np.stack([self.closure.observed(steps[k]) for k in self.protocol.frame_steps])
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """All frames, one after another, and their Jacobian.
 
-        Inadmissible moduli and cycles that do not converge are failed predictions, not errors.
+        Inadmissible moduli and cycles that do not converge give failed predictions, not errors.
         """
         try:
             simulation = self.run(m)
@@ -202,7 +202,7 @@ class CycleModel:
 def compare_time_steps(
     model: CycleModel, dts: Sequence[float], path: FloatArray
 ) -> list[dict[str, Any]]:
-    """How the frames of a cycle depend on the time step, along a path of parameters.
+    """Measure how the frames of a cycle depend on the time step, along a path of parameters.
 
     Parameters
     ----------
@@ -214,15 +214,15 @@ def compare_time_steps(
     Returns
     -------
     list of dict
-        One for each time step ``dt`` (s): ``change`` (mm, root mean square over all frames) if the
-        step is halved; its ``order``, the binary logarithm of the ratio of two such changes;
-        ``unevenness``, the largest change along the path over the median one, large if frames jump;
-        and the ``reason`` why the path ended early. None for unknown numbers.
+        One for each time step ``dt`` (s): ``change`` (mm, root mean square over all frames) when
+        the step is halved; its ``order``, the binary logarithm of the ratio of two such changes;
+        ``unevenness``, the largest over the median change along the path, large if frames jump; and
+        the ``reason`` why the path ended early. Unknown numbers are None.
 
     Raises
     ------
     InputError
-        If steps are not halved.
+        If a step is not half of the one before.
     """
     if any(not np.isclose(b, 0.5 * a) for a, b in pairwise(dts)):
         raise InputError(f"time steps {list(dts)} s, expected each to be half of the one before")
@@ -253,12 +253,12 @@ def _rms(values: FloatArray) -> float:
 def with_mesh_error(
     found: Estimate, R: NoiseCovariance, other: CycleModel
 ) -> tuple[Estimate, FloatArray, float]:
-    """An estimate from a whole cycle, with the error of its mesh in its covariance.
+    """Add the mesh error to the covariance of an estimate from a whole cycle.
 
     Parameters
     ----------
     found : Estimate
-        With a prediction of all vertices in all frames.
+        Includes a prediction of all vertices in all frames.
     R : noise covariance
         Of the observation.
     other : CycleModel
@@ -268,7 +268,7 @@ def with_mesh_error(
     -------
     Estimate
     ndarray, (p,)
-        Shift by the mesh, in units of the parameters.
+        Shift due to the mesh, in units of the parameters.
     float
         mm, mean distance between the frames of the two meshes.
 

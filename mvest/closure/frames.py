@@ -1,9 +1,9 @@
-"""Several closed frames of one valve as one prediction, each under its own pressure.
+"""Predicts several closed frames of one valve together, each under its own pressure.
 
 All frames share the tissue, the chordae and everything else. Each frame is the equilibrium under
-its own pressure, annulus and papillary tips, reached from the one before it. A stated pressure P in
-mmHg may be wrong in three ways: the true one is ``scale (P + offset + error)``, with one scale and
-one offset for all frames (calibration and zero of the measurement) and an error of each frame.
+its own pressure, annulus and papillary tips, reached from the previous frame. A stated pressure P
+(mmHg) may be wrong in three ways: the true pressure is ``scale (P + offset + error)``, with one
+scale and offset for all frames (calibration and zero of the sensor) and one error per frame.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 
 OFFSET, ERROR = "pressure_offset", "pressure_error"
-"""Parameters in mmHg: offset of all stated pressures, and (``ERROR.FRAME``) error of one."""
+"""Parameters in mmHg: offset of all stated pressures, and error of one (``ERROR.FRAME``)."""
 
 SCALE = "pressure_scale"
-"""The factor on all of them, a parameter of the closure."""
+"""The factor on all stated pressures, a parameter of the closure."""
 
 
 def is_frame_pressure(name: str) -> bool:
-    """Whether a parameter is an error of stated pressures, unknowable from one frame."""
+    """Whether a parameter is a pressure error that one frame cannot determine."""
     return name.partition(".")[0] in (OFFSET, ERROR)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FramesModel:
-    """The open valve, and several closed frames of it.
+    """A model of the open valve and several closed frames.
 
     Raises
     ------
     InputError
-        If an error belongs to no frame, or `SCALE` is missing.
+        If an error refers to no frame, or `SCALE` is missing.
     """
 
     model: ClosureModel  #: closes the valve to the closed frame, under the pressure of its protocol
@@ -48,7 +48,7 @@ class FramesModel:
     #: frame -> its loads, on the contact valve's annulus, in the order in which they are reached
     states: Mapping[str, HeldState]
     pressure_mmHg: float  #: stated pressure of the closed frame, as in the model's protocol
-    #: parameters that are errors of stated pressures; with any of them, `SCALE` must be a parameter
+    #: parameters that are errors of stated pressures; if there are any, `SCALE` must be a parameter
     #: of the model
     errors: tuple[str, ...] = ()
 
@@ -67,7 +67,7 @@ class FramesModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameters, those of the closure first ``(p,)``."""
+        """Names of the parameters ``(p,)``, those of the closure first."""
         return (*self.model.names, *self.errors)
 
     @property
@@ -82,22 +82,22 @@ class FramesModel:
 
     @property
     def closed(self) -> ClosedState | None:
-        """Start of the next prediction."""
+        """The closed state from which the next prediction starts."""
         return self.model.closed
 
     def restart(self, closed: ClosedState | None) -> None:
-        """Forget everything but where to start from."""
+        """Forget everything except the starting state."""
         self.model.restart(closed)
 
     def of_closure(self, m: FloatArray) -> FloatArray:
-        """Parameters with which the closure has the true pressure in the closed frame."""
+        """Parameters that give the closure the true pressure in the closed frame."""
         own = np.array(m[: len(self.model.names)], dtype=np.float64)
         if self.errors:
             own[self.model.names.index(SCALE)] *= self._true_over_stated(m)
         return own
 
     def under(self, m: FloatArray, states: Mapping[str, HeldState]) -> list[HeldState]:
-        """The true loads of ``states``; frames that are not fitted have no error of their own.
+        """The true loads of ``states``; frames that are not fitted have no individual error.
 
         The closure multiplies these pressures by its own factor, see `of_closure`.
         """
@@ -110,7 +110,7 @@ class FramesModel:
     def __call__(self, m: FloatArray, /) -> Prediction:
         """The open valve, the frames of ``states`` and the closed one, and their Jacobian.
 
-        A frame without an equilibrium is a failed prediction.
+        A frame without an equilibrium gives a failed prediction.
         """
         m = np.asarray(m, dtype=np.float64)
         if not self._true_over_stated(m) > 0.0:
@@ -137,14 +137,14 @@ class FramesModel:
         return stated + errors.get(OFFSET, 0.0) + errors.get(f"{ERROR}.{frame}", 0.0)
 
     def _true_over_stated(self, m: FloatArray) -> float:
-        """Of the closed frame's pressure, without the scale."""
+        """True over stated pressure of the closed frame, without the scale."""
         stated = self.pressure_mmHg
         return 1.0 + (self._unscaled(m, self.closed_name, stated) - stated) / stated
 
     def _by_all(
         self, by_closure: FloatArray, m: FloatArray, frame: str, stated: float
     ) -> FloatArray:
-        """Derivatives ``(k, p)`` of a frame by all parameters from those by the closure's."""
+        """Derivatives ``(k, p)`` of a frame by all parameters, from those by the closure's."""
         if not self.errors:
             return by_closure
         at = self.model.names.index(SCALE)

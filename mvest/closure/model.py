@@ -36,27 +36,27 @@ from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 CONTINUED = 40
 """Newton iterations after which a guided valve stops searching for its next equilibrium and is
 closed by its guide. If moduli change by 30 %, ``hex18`` needs 4 to 11 and linear tetrahedra up to
-32, a third of the guide's cost. Where the iterations diverge (160 x 19 cells) they never end."""
+32, a third of the guide's cost. Diverging iterations (160 x 19 cells) would never end."""
 
 REST = (0.05, 0.15)
 """s, time steps in which a state from another mesh comes to rest under the final loads. Damping
-holds what the coarser mesh could not resolve. Without it, large meshes (160 x 19 cells) find no
-equilibrium from there."""
+restrains motions that the coarser mesh could not resolve. Without it, large meshes (160 x 19 cells)
+find no equilibrium from there."""
 
 
 def _resting(start: float, end: float) -> list[Step]:
-    """Steps of rest from ``start`` s, then an equilibrium as much later than ``end`` s."""
+    """Resting steps from ``start`` s, then an equilibrium equally long after ``end`` s."""
     return [*(Step(start + t) for t in accumulate(REST)), Step(end + sum(REST), static=True)]
 
 
 def failure_of(simulation: Simulation) -> str:
-    """Why and when a simulation failed."""
+    """Describe why and when a simulation failed."""
     return f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosureResult:
-    """A closure with the system it was computed on."""
+    """A closure, with the system on which it was computed."""
 
     system: System
     simulation: Simulation
@@ -74,32 +74,32 @@ class ClosureModel:
     names: tuple[str, ...]
     #: values of the parameters that are not estimated
     fixed: dict[str, float] = field(default_factory=dict)
-    #: whether a closure starts from the last closed state, or from where its derivatives predict
-    #: the next one, and goes straight to the new equilibrium. Otherwise each starts from the open
-    #: valve. Both give the same closed state if it is unique, which the gate
-    #: (:mod:`mvest.closure.robustness`) tests.
+    #: whether a closure starts from the last closed state, extrapolated with its derivatives if
+    #: known, and goes straight to the new equilibrium. Otherwise each closure starts from the open
+    #: valve. Both give the same closed state if it is unique; the gate
+    #: (:mod:`mvest.closure.robustness`) tests this.
     continuation: bool = False
     #: largest change of a coordinate (:class:`mvest.closure.continuation.Coordinates`) over which a
-    #: closure is continued. Beyond it the valve is closed from the open state: a much softer valve
-    #: may fold differently.
+    #: closure is continued. Beyond it the valve closes from the open state, because a much softer
+    #: valve may fold differently.
     reach: float = np.inf
     #: the same valve and parameters on a coarser mesh. A closure that would start from the open
-    #: valve is computed there first, and the search for equilibrium on this mesh starts from its
-    #: closed state. A guide may have a guide.
+    #: valve is computed there first; its closed state is the starting point for the equilibrium on
+    #: this mesh. A guide may have a guide.
     guide: ClosureModel | None = None
-    #: whether a continued closure that fails is repeated with the guide, and then from the open
-    #: valve, which takes long and seldom succeeds
+    #: whether a failed continued closure is repeated with the guide, and then from the open valve,
+    #: which takes long and seldom succeeds
     repeat: bool = True
     #: largest change of a coordinate between continued equilibria. A more distant state is reached
-    #: through others: Newton's method does not find equilibria millimetres away.
+    #: in several steps, because Newton's method does not find equilibria millimetres away.
     largest_change: float = np.inf
-    #: whether a continued valve without a near closed state is closed first at rounded parameters
+    #: whether a continued valve without a nearby closed state first closes at rounded parameters
     #: (:meth:`mvest.closure.continuation.Coordinates.rounded`). All estimates of a valve with
     #: similar starting values then begin from the same closed state.
     rounded_start: bool = False
     #: progress: called with (time, Newton iterations)
     on_step: Callable[[float, int], None] | None = None
-    #: pairs of points that are held together while the valve closes, as by a clip
+    #: pairs of points held together while the valve closes, as by a clip
     ties: TiedPoints | None = None
     #: (n, 3) mm, optional, initial displacement of the nodes of the open valve
     perturbation: FloatArray | None = None
@@ -119,13 +119,13 @@ class ClosureModel:
             )
 
     def fresh(self) -> ClosureModel:
-        """The same model before it has built or closed anything, without a progress callback."""
+        """A copy that has built and closed nothing yet, without a progress callback."""
         guide = None if self.guide is None else self.guide.fresh()
         return replace(self, guide=guide, on_step=None)
 
     @property
     def contact_reach_mm(self) -> float:
-        """Distance of midsurfaces at the free edge within which contact acts."""
+        """Distance between midsurfaces at the free edge within which contact acts."""
         edge = float(self.valve.surface.thickness[self.valve.free_edge].mean())
         return self.settings.contact.activation_distance * edge
 
@@ -148,12 +148,12 @@ class ClosureModel:
         return {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
 
     def damping(self, m: FloatArray) -> Damping:
-        """The damping with parameters ``m (p,)``; it may be one of them."""
+        """The damping at parameters ``m (p,)``; it may be one of them."""
         own = self.settings.damping
         return replace(own, beta=self._values(m).get("damping", own.beta))
 
     def tuned(self, m: FloatArray) -> tuple[System, tuple[Parameter, ...]]:
-        """The system, set to parameters ``m (p,)``, and the parameters to differentiate by.
+        """The system at parameters ``m (p,)``, and the parameters for derivatives.
 
         The system is built once and belongs to the model.
 
@@ -180,8 +180,8 @@ class ClosureModel:
     def restart(self, closed: ClosedState | None) -> None:
         """Forget everything but ``closed``, from which the next closure may be continued.
 
-        Later results depend on ``closed`` alone, to the last bit: the sparsity pattern and the
-        order of elimination, which depend on contact so far, are reset.
+        Later results then depend only on ``closed``, to the last bit: the sparsity pattern and the
+        elimination order, which depend on earlier contact, are reset.
         """
         self._closed = None if closed is None else replace(closed, guide=None)
         if self._system is not None:
@@ -199,7 +199,7 @@ class ClosureModel:
         )
 
     def _way_to(self, m: FloatArray) -> list[FloatArray]:
-        """Parameters between the last closed state and ``m``, if it is continued from there."""
+        """Intermediate parameters from the last closed state to ``m``, if continued from there."""
         if self._closed is None or not self._near(m):
             return []
         return self._coordinates.between(self._closed.at, m, self.largest_change)
@@ -215,8 +215,8 @@ class ClosureModel:
         sensitivities : bool
             Whether the last frame is differentiated.
         every_frame : bool
-            Whether all frames are wanted, and not only the last one. They are then solved to the
-            full tolerance, and the closure starts from the open valve.
+            Whether all frames are needed, not only the last. They are then solved to the full
+            tolerance, and the closure starts from the open valve.
 
         Raises
         ------
@@ -229,7 +229,7 @@ class ClosureModel:
         stiffens = np.array([name.startswith("stiffening.") for name in self.names], dtype=bool)
         continued = self.continuation and self.settings.protocol.equilibrium
         if continued and np.any(m[stiffens] > 0.0) and not self._near(m):
-            # Linear tissue leads to the same equilibrium and closes six times as fast.
+            # Linear tissue reaches the same equilibrium six times as fast.
             self._close(np.where(stiffens, 0.0, m))
         for between in self._way_to(m):
             result = self._close(between)
@@ -243,11 +243,11 @@ class ClosureModel:
         return result
 
     def _close_rounded(self, m: FloatArray) -> bool:
-        """Close the valve at rounded parameters if no closed state is near; True if it closes."""
+        """Close the valve at rounded parameters if no closed state is near; return success."""
         steady = self.continuation and self.settings.protocol.equilibrium
         if not (self.rounded_start and steady) or self._near(m):
             return False
-        self.tuned(m)  # refuses inadmissible parameters before anything is closed
+        self.tuned(m)  # raises on inadmissible parameters before closing anything
         at = self._coordinates.rounded(m)
         if not self._coordinates.distance(at, m) <= min(self.reach, SPACING):
             return False
@@ -318,7 +318,7 @@ class ClosureModel:
 
     @cached_property
     def _in_guide(self) -> Embedding | None:
-        """The mesh's nodes in the guide's mesh; None if its coarse cells do not hold them."""
+        """The mesh's nodes embedded in the guide's mesh; None if its cells do not contain them."""
         assert self.guide is not None
         try:
             return embed(self.guide.mesh, self.mesh.nodes)
@@ -333,7 +333,7 @@ class ClosureModel:
         sensitivities: bool = False,
         start: FloatArray | None = None,
     ) -> list[Simulation]:
-        """The closure, then one equilibrium after the other, up to the first that fails.
+        """Compute the closure, then one equilibrium after another until one fails.
 
         Parameters
         ----------
@@ -343,8 +343,8 @@ class ClosureModel:
         sensitivities : bool
             Whether all of them are differentiated.
         start : (n, 3) mm, optional
-            Nodal positions from which the closed state is found by rest under the final loads, as
-            of a closed valve of other tissue.
+            Nodal positions, for example of a closed valve of other tissue, that are brought to rest
+            under the final loads to find the closed state.
 
         Raises
         ------
@@ -378,8 +378,8 @@ class ClosureModel:
     ) -> Simulation:
         """Equilibrium under constant loads from nodal positions ``start (n, 3)``.
 
-        It is solved at once, or, if that fails or ``damped``, after some time steps: damping helps
-        leaflets to slide over each other.
+        Solved directly; if that fails, or if ``damped``, solved after some time steps, whose
+        damping helps leaflets slide over each other.
         """
         assert self._system is not None
         end = self.settings.protocol.end
@@ -404,7 +404,7 @@ class ClosureModel:
     def held(self, m: FloatArray, states: Sequence[HeldState]) -> list[FloatArray | None]:
         """Observed vertices ``(n, 3)`` mm in the equilibria under other loads; see `rests`.
 
-        From the first state without an equilibrium on, the result is None.
+        The first state without an equilibrium, and all after it, give None.
         """
         ends = [end for end in self.rests(m, states)[1:] if end.converged]
         frames: list[FloatArray | None] = [self.observed(end.frames[-1]) for end in ends]
@@ -413,7 +413,7 @@ class ClosureModel:
     def predict_held(self, m: FloatArray, states: Sequence[HeldState]) -> list[Prediction]:
         """Predictions of the closed valve and of its equilibria under other loads; see `rests`.
 
-        The last prediction is the first that fails, if one does.
+        The list ends with the first failed prediction, if any.
         """
         try:
             ends = self.rests(m, states, sensitivities=True)
@@ -432,7 +432,7 @@ class ClosureModel:
     def __call__(self, m: FloatArray) -> Prediction:
         """Positions of the observed vertices in the open and the closed frame, and their Jacobian.
 
-        Inadmissible moduli and closures that do not converge are failed predictions, not errors.
+        Inadmissible moduli and closures that do not converge give failed predictions, not errors.
         """
         (closed,) = self.predict_held(m, ())
         if not closed.converged:

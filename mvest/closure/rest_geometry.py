@@ -1,8 +1,8 @@
-"""How errors of a valve's geometry move its closed state: open shape, boundary, thickness, fibres.
+"""How errors in open shape, boundary, thickness and fibres move a valve's closed state.
 
-A change of the surface at rest is carried into the mesh and to the contact samples: each of them
-keeps its position on the surface and its share of the thickness. All embeddings stay as they are,
-so that the same material points are observed, touch and are held.
+A change of the rest surface moves the mesh nodes and the contact samples: each keeps its position
+on the surface and its fraction of the thickness. Embeddings do not change, so the same material
+points are observed, touch and are held.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from mvest.valve.geometry.triangles import unit_rows
 from mvest.valve.mesh.solid_mesh import Embedding, embed
 
 PARTS = ("shape", "thickness", "fibres", "annulus", "tips", "rest_lengths", "insertions")
-"""Parts of a geometry; each has a method of `RestGeometry`."""
+"""Parts of a geometry; `RestGeometry` has a method for each."""
 
 
 class RestGeometry:
-    """The geometry at rest of a closing valve, and how its closed state changes with it.
+    """The rest geometry of a closing valve, and the closed state's dependence on it.
 
     Parameters
     ----------
     model : ClosureModel
         Its protocol must end in an equilibrium.
     seen : ClosureModel, optional
-        The model before it was displaced, if changes are measured from there.
+        The undisplaced model, if changes are measured from it.
 
     Raises
     ------
     InputError
-        If the protocol does not end in equilibrium: a moving valve has a history, which depends on
-        the geometry too.
+        If the protocol does not end in equilibrium: a moving valve has a history, which also
+        depends on the geometry.
     """
 
     def __init__(self, model: ClosureModel, seen: ClosureModel | None = None) -> None:
@@ -62,7 +62,7 @@ class RestGeometry:
         self._closest = closest_points(nodes, vertices, triangles)
         self._normal = unit_rows(self._at(self._closest, self._normals))
         # Each node is exactly foot + height * normal, so that it turns with the surface. The foot
-        # lies in the plane of the closest triangle, and possibly outside of it.
+        # is in the plane of the closest triangle, possibly outside the triangle.
         a, b, c = np.moveaxis(vertices[triangles[self._closest.triangle]], 1, 0)
         across = np.cross(b - a, c - a)
         height = np.sum((nodes - a) * across, axis=1) / np.sum(self._normal * across, axis=1)
@@ -105,8 +105,8 @@ class RestGeometry:
     def shape(self, moves: FloatArray) -> RestVariation:
         """Change of the open shape by displacements ``(q, n, 3)`` mm of the surface's vertices.
 
-        The annulus and the papillary tips of the closed valve stay where they are; the chordae
-        follow the leaflets.
+        The annulus and the papillary tips of the closed valve do not move; the chordae follow the
+        leaflets.
         """
         contact, by_vertex = self.model.contact_valve.surface, np.moveaxis(moves, 0, -1)
         members, weights, slope = self._patches
@@ -154,8 +154,8 @@ class RestGeometry:
     def tips(self, moves: FloatArray, rest_length: FloatArray | None = None) -> RestVariation:
         """Displacements ``(q, t, 3)`` mm of the closed valve's papillary tips.
 
-        ``rest_length (q, c)`` is the relative change of the chordae's rest length, if it follows
-        from the tips.
+        ``rest_length (q, c)`` is the relative change of the chordae's rest length, if the tips
+        determine it.
         """
         return RestVariation(self._still(len(moves)), tips=moves, rest_length=rest_length)
 
@@ -172,19 +172,19 @@ class RestGeometry:
         return RestVariation(self._still(len(moves)), patches=patches, members=members)
 
     def variation(self, parts: Mapping[str, FloatArray]) -> RestVariation:
-        """Change of several `PARTS` at once, each ``(q, ...)`` as its method takes it."""
+        """Change of several `PARTS` at once, each ``(q, ...)`` in its method's form."""
         return RestVariation.summed([getattr(self, name)(values) for name, values in parts.items()])
 
     def displaced(self, parts: Mapping[str, FloatArray]) -> ClosureModel:
-        """The model of the valve with another geometry, its guide's too; it has closed nothing.
+        """A fresh model of the valve with another geometry; its guide changes too.
 
-        All embeddings stay where they are in the material. A displacement of the open shape moves
-        the mesh as its derivative predicts.
+        Embeddings keep their material points. A displacement of the open shape moves the mesh as
+        its derivative predicts.
 
         Parameters
         ----------
         parts : mapping
-            Some of `PARTS` -> one quantity, as `variation` takes several.
+            Some of `PARTS` -> one quantity each, where `variation` takes several.
 
         Raises
         ------
@@ -249,12 +249,12 @@ class RestGeometry:
         Parameters
         ----------
         m : (p,)
-            Parameters of the closure; the valve is closed with them if it is not already.
+            Parameters of the closure; the valve first closes with them if necessary.
         variation : RestVariation
         states : sequence of HeldState
-            Other loads, reached from the closed valve.
+            Other loads, applied to the closed valve.
         tolerance : float
-            Of each derivative, relative.
+            Relative tolerance of each derivative.
         """
         model = self.model
         if model.closed is None or not np.array_equal(model.closed.at, m):

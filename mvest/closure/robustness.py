@@ -1,9 +1,9 @@
-"""Is the closed state unique? A gate that every anatomy should pass.
+"""The gate: tests whether the closed state is unique. Every anatomy should pass it.
 
 Fitted moduli mean nothing if a smaller time step, a finer mesh or a slightly different modulus
 folds the leaflets differently. The gate closes the valve under variations that must not matter and
 compares the closed surfaces. It also follows the closed surface along changing moduli
-(:mod:`mvest.closure.smoothness`), where it may bend but must not jump.
+(:mod:`mvest.closure.smoothness`): the path may curve but must not jump.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ MAX_LIMIT = 0.5
 
 PERTURBATION = 1.0
 WAVELENGTH = 30.0
-"""mm, largest displacement of a perturbed start, and wavelength of its waves: so long that the
-thick, warped leaflets do not pass through each other."""
+"""mm, largest displacement of a perturbed start, and its wavelength, long enough that the thick,
+warped leaflets do not intersect."""
 WAVES = 4
 
 COMMON = (0.8, 0.95, 1.05, 1.2)
 SINGLE = (0.8, 1.2)
-"""First factors of a path, on all moduli together and on one alone."""
+"""First factors of a path, on all moduli together and on a single modulus."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,20 +42,20 @@ class GateCase:
     name: str
     dt: float = 1.0  #: factor on the time step
     ramp: float = 1.0  #: factor on the time over which pressure and boundary motion rise
-    converged_path: bool = False  #: whether every step is solved as exactly as the last
+    converged_path: bool = False  #: whether every step is solved as accurately as the last
     mesh: float = 1.0  #: factor on the number of cells along both directions of the leaflets
     activation: float = 1.0  #: factor on the activation distance of contact
     sampling: float = 1.0  #: factor on the density of the contact samples along both directions
     guided: bool = False  #: whether the model's guide is used
     #: seed of a smooth displacement of the open leaflets before they close; 0 for none
     perturbed: int = 0
-    #: factor on all moduli E_f at which the valve is closed first, and continued from; 1: closed
+    #: factor on all moduli E_f at which the valve first closes, and is continued from; 1: it closes
     #: from the open valve
     start: float = 1.0
 
     @property
     def remeshed(self) -> bool:
-        """Whether it needs another mesh or other contact samples than a model has."""
+        """Whether the case needs another mesh or other contact samples than the model's."""
         return self.mesh != 1 or self.sampling != 1
 
 
@@ -84,7 +84,7 @@ class GateRow:
     ----------
     case : str
     mean_mm, max_mm : float
-        Distance of the closed surface from the reference's; NaN if the closure failed.
+        Distance between this closed surface and the reference's; NaN if the closure failed.
     passed : bool
     reason : str
     """
@@ -101,7 +101,7 @@ class GateReport:
     """All cases, the reference first, and the paths along the moduli.
 
     There is a path along a common factor on all moduli and, if there are several, along each of
-    them. Without a closed reference there is none.
+    them. Without a closed reference there are no paths.
     """
 
     rows: tuple[GateRow, ...]
@@ -114,12 +114,12 @@ class GateReport:
 
 
 def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
-    """A fresh model that closes from the open valve, with all of a case but another mesh.
+    """A fresh model that closes from the open valve, with a case's changes except the mesh.
 
     Raises
     ------
     InputError
-        If the case needs another mesh or other contact samples, which only an anatomy can give.
+        If the case needs another mesh or other contact samples; these must come from an anatomy.
     """
     if case.remeshed:
         raise InputError(f"gate case {case.name!r} needs another mesh or other contact samples")
@@ -144,7 +144,7 @@ def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
 
 
 def _perturbation(mesh: SolidMesh, seed: int) -> FloatArray:
-    """A sum of plane waves ``(n, 3)`` mm at the nodes, scaled to the stated displacement."""
+    """A sum of plane waves ``(n, 3)`` mm at the nodes, scaled to the largest displacement."""
     rng = np.random.default_rng(seed)
     normals, sides = rng.standard_normal((2, WAVES, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -170,7 +170,7 @@ def run_gate(
         ``(p,)`` parameters; moduli are those named ``E_f.*``.
     cases : sequence of GateCase
     on_case, on_path : callable, optional
-        Called with each row, and each path, as it is finished.
+        Called with each finished row, and each finished path.
     """
     model = build(REFERENCE)
     is_modulus = np.array([name.startswith("E_f.") for name in model.names])

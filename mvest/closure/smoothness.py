@@ -1,28 +1,28 @@
-r"""Does the closed valve jump while a modulus changes? Tells curvature from jumps.
+r"""Tests whether the closed valve jumps while a modulus changes; curvature is not a jump.
 
-The closed state of any valve is a curved function of the moduli, so that differences over wide
-steps disagree with the derivative. A healthy valve does not jump, though. With the exact derivative
-d = dx / d log E at two states, their distance is explained up to
+The closed state of any valve is a curved function of the moduli, so differences over wide steps
+disagree with the derivative. A well-behaved valve does not jump, though. Given the exact derivative
+d = dx / d log E at two states, the unexplained part of their distance is
 
 .. math:: r = x_b - x_a - \tfrac12 (d_a + d_b) \log (E_b / E_a) .
 
-For a smooth response this error of the trapezoidal rule is -x''' h^3 / 12: half the step leaves an
-eighth. A jump does not shrink with the step. A kink (a slope that changes by k) leaves at most
+For a smooth response this error of the trapezoidal rule is -x''' h^3 / 12: halving the step leaves
+an eighth. A jump does not shrink with the step. A kink (slope change k) leaves at most
 k h / 2. A piece of the path is halved if more than `JUMP_LIMIT` of any vertex or more than
 `SLOPE_LIMIT` of the motion of all vertices is unexplained, until it is narrower than `RESOLUTION`.
 The path then fails if
 
-* a vertex moves by more than `JUMP_LIMIT` unexplained, which is a jump;
-* more than `SLOPE_LIMIT` of a piece's motion is unexplained, and some vertex moves by more than
-  `SEEN` unexplained;
-* the unexplained parts add up to more than `SLOPE_LIMIT` of the whole motion, as with derivatives
-  that are wrong everywhere or with many small jumps;
-* a state's derivative explains neither of its two sides to `SIDE_LIMIT`. At a kink it is right on
-  one side.
+* the unexplained motion of a vertex exceeds `JUMP_LIMIT`, which is a jump;
+* more than `SLOPE_LIMIT` of a piece's motion is unexplained, and some vertex has more than `SEEN`
+of unexplained motion;
+* the unexplained parts add up to more than `SLOPE_LIMIT` of the whole motion, as happens if
+  derivatives are wrong everywhere or there are many small jumps;
+* a state's derivative leaves more than `SIDE_LIMIT` unexplained on both sides. At a kink it is
+  right on one side.
 
-Not detected are: states that leave and return between two neighbours; jumps smaller than the limit;
-a derivative that is wrong only at an end of the path; and whether a change steeper than the
-resolution is continuous, which makes no difference to an estimate of that modulus.
+The test does not detect: states that leave and return between two neighbours; jumps smaller than
+the limit; a derivative that is wrong only at an end of the path; and whether a change steeper than
+the resolution is continuous, which does not affect an estimate of that modulus.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ import numpy as np
 from mvest.typing import FloatArray
 
 JUMP_LIMIT = 0.1
-"""mm, largest accepted unexplained motion of any vertex, as the mean over other numerics may be."""
+"""mm, largest accepted unexplained motion of any vertex; equals the gate's limit on the mean."""
 SLOPE_LIMIT = 0.05
-"""Largest accepted unexplained share of the motion of all vertices, of a piece and in total."""
+"""Largest accepted unexplained fraction of the motion of all vertices, per piece and in total."""
 SEEN = 0.02
 """mm, smallest motion of a single point that an estimator can see: `resolution_mm` of
 :class:`mvest.observation.learned.ErrorBeliefs`."""
 SIDE_LIMIT = 0.2
-"""Unexplained share on both sides of a state above which its derivative, and with it the width of
+"""Unexplained fraction on both sides of a state above which its derivative, and hence the width of
 an interval, is wrong by half (if it is half too large: h d / 4 of 5 h d / 4)."""
 RESOLUTION = 0.02
-"""Width in log E below which a piece is not halved any more."""
+"""Width in log E below which a piece is no longer halved."""
 ROUND_OFF = 1e-6
 """mm, unexplained motion below this counts as zero."""
 
@@ -70,7 +70,7 @@ class Piece:
     unexplained_mm : float
         Largest unexplained motion of a vertex.
     vertices : int
-        How many exceed `JUMP_LIMIT`.
+        Number of vertices that exceed `JUMP_LIMIT`.
     unexplained, way : float
         mm, unexplained motion and whole motion by the derivatives; norms over all vertices.
     """
@@ -95,12 +95,12 @@ class Piece:
 
     @property
     def share(self) -> float:
-        """Unexplained share of the motion; 0 for mere round-off."""
+        """Unexplained fraction of the motion; 0 for mere round-off."""
         return 0.0 if self.unexplained_mm <= ROUND_OFF else _share(self.unexplained, self.way)
 
     @property
     def explained(self) -> bool:
-        """Whether it need not be halved."""
+        """Whether the piece needs no halving."""
         return self.unexplained_mm <= JUMP_LIMIT and self.share <= SLOPE_LIMIT
 
     @property
@@ -110,7 +110,7 @@ class Piece:
 
     @property
     def fault(self) -> str:
-        """Why it fails if it is not halved any more; empty if it passes."""
+        """Why the piece fails if it is not halved further; empty if it passes."""
         if self.explained or self.unexplained_mm <= SEEN:
             return ""
         where = f"between {_percent(self.low)} and {_percent(self.high)}"
@@ -128,12 +128,12 @@ class Path:
 
     name: str  #: what is changed
     pieces: tuple[Piece, ...]  #: in ascending order, after halving; up to the first that fails
-    closures: int  #: how many states were computed, without the central one
+    closures: int  #: number of computed states, without the central one
     reason: str  #: why it fails; empty if it passes
 
     @property
     def share(self) -> float:
-        """Unexplained share of the whole motion; contributions of pieces do not cancel."""
+        """Unexplained fraction of the whole motion; contributions of pieces do not cancel."""
         unexplained = sum(piece.unexplained for piece in self.pieces if piece.share > 0)
         return _share(unexplained, sum(piece.way for piece in self.pieces))
 
@@ -155,9 +155,9 @@ def follow(
     ----------
     name : str
     close : callable
-        Factor -> state, or the reason why there is none.
+        Maps a factor to a state, or to the reason why there is none.
     centre : PathState
-        At the factor 1.
+        The state at factor 1.
     factors : sequence of float
         First other factors, below and above 1.
     """
@@ -178,7 +178,7 @@ def follow(
         if reason := failure(factor):
             return Path(name, (), tried, reason)
     reason = ""
-    # A stack, so that pieces come in ascending order.
+    # A stack, so that pieces are finished in ascending order.
     waiting = [*pairwise(sorted(states))][::-1]
     while waiting and not reason:
         low, high = waiting.pop()

@@ -1,1 +1,1 @@
-"""Files of other programs, in and out."""
+"""Import and export of other programs' files."""

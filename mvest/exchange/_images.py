@@ -1,8 +1,8 @@
 """Headers and voxels of NIfTI (nibabel), MetaImage (SimpleITK) and DICOM (pydicom) files.
 
 Runs in the child process; `mvest.exchange._nrrd` reads NRRD. Libraries fill in missing fields (a
-spacing of 1, an origin of 0); here they are errors. The number of voxels must be that of the
-header: SimpleITK accepts some truncated files.
+spacing of 1, an origin of 0); here a missing field is an error. The number of voxels must match
+the header, because SimpleITK accepts some truncated files.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from mvest.typing import FloatArray
 Voxels = NDArray[np.generic]
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "meter": 1e3, "micron": 1e-3}
-"""Units of length by their names in NRRD and NIfTI."""
+"""Units of length, by their names in NRRD and NIfTI."""
 
 
 def fault(where: str, found: object, expected: str) -> InputError:
-    """The error of a wrong field; the parent process adds the name of the file."""
+    """The error for a wrong field; the parent process adds the name of the file."""
     return InputError(f"{where}: {one_line(found, 120)}, expected {expected}")
 
 
@@ -40,7 +40,7 @@ def check(holds: object, where: str, found: object, expected: str) -> None:
 
 
 class Segment(NamedTuple):
-    """A segment of a ``.seg.nrrd`` file: the value of its voxels, and their layer."""
+    """A segment of a ``.seg.nrrd`` file: its name, voxel value and layer."""
 
     name: str
     tags: str
@@ -50,12 +50,12 @@ class Segment(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stated:
-    """The header of a file; plausibility is not checked. Empty or None: not stated.
+    """The header of a file, not checked for plausibility. Empty or None: not stated.
 
-    ``shape`` is (F, I, J, K) with F frames or layers. In LPS and mm, the columns of ``steps``
-    (3, 3) lead to the next voxel along i, j and k, and ``origin`` is the centre of voxel (0, 0, 0).
+    ``shape`` is (F, I, J, K) with F frames or layers. The columns of ``steps`` (3, 3) are the steps
+    to the next voxel along i, j and k, and ``origin`` is the centre of voxel (0, 0, 0); LPS, mm.
     ``names`` are the format's names of size, steps, origin, values and times. ``times`` (F,) are in
-    ``unit``. ``labels`` is the field that makes the voxels labels, ``data_file`` a separate file
+    ``unit``. ``labels`` is the field that marks the voxels as labels, ``data_file`` a separate file
     with the voxels.
     """
 
@@ -83,7 +83,7 @@ def required(fields: Mapping[str, Any], name: str, expected: str) -> Any:
 
 
 def neighbour_file(path: Path, where: str, name: str) -> Path:
-    """The data file of a header, which must lie in the same folder."""
+    """The data file that a header names; it must be in the same folder."""
     other = path.parent / name
     inside = name.isprintable() and other.resolve().parent == path.parent.resolve()
     check(inside and "\\" not in name, where, repr(name), "the name of a file in the same folder")
@@ -97,8 +97,8 @@ def _check_length(where: str, found: int, sizes: Any, dtype: np.dtype[Any]) -> N
     check(found == expected, where, f"{found} bytes", words)
 
 
-# NIfTI 1 and 2 are RAS. If the unit of length is missing, it is mm: the spacings of no other unit
-# are plausible.
+# NIfTI 1 and 2 are RAS. A missing unit of length is taken as mm: in any other unit the spacings
+# would be implausible.
 
 RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
 
@@ -109,7 +109,7 @@ def nifti(path: Path, begin: bytes) -> Opened:
     kind: Any = nibabel.Nifti2Header if begin[4:6] == b"n+" else nibabel.Nifti1Header
     whole = b"ni" not in (begin[344:346], begin[4:6])
     check(whole, "magic", "a header without its image", "one file, .nii or .nii.gz")
-    # nibabel's checks would correct errors by guessing.
+    # nibabel's checks would guess corrections.
     header = kind(begin[: kind.template_dtype.itemsize], check=False)
     sizes, dtype = header.get_data_shape(), header.get_data_dtype()
     affine = np.asarray(header.get_best_affine(), dtype=np.float64)
@@ -151,8 +151,8 @@ def nifti(path: Path, begin: bytes) -> Opened:
     ), load
 
 
-# MetaImage is LPS in mm; the fourth spacing is the time between frames, without a unit. ITK invents
-# missing fields, and voxels of damaged compressed data.
+# MetaImage is LPS in mm; the fourth spacing is the time between frames, without a unit. ITK makes
+# up missing fields, and voxels where compressed data are damaged.
 
 METAIMAGE_FIELDS = (
     ("ElementSpacing",),
@@ -215,15 +215,15 @@ def metaimage(path: Path, head: bytes) -> Opened:
     ), load
 
 
-# Philips Cartesian DICOM: 3D echo over time as QLAB exports it, one file per recording. It is DICOM
-# in form only: unique identifiers and preamble may be missing. Columns, rows and frames are in
-# standard fields, the number of slices is (3001,1001); spacings in cm are PhysicalDeltaX,
+# Philips Cartesian DICOM: 3D echo over time as QLAB exports it, one file per recording. It is not
+# fully DICOM: unique identifiers and preamble may be missing. Columns, rows and frames are in
+# standard fields, the number of slices is in (3001,1001); spacings in cm are PhysicalDeltaX,
 # PhysicalDeltaY and (3001,1003); FrameTime is ms. The voxels, columns fastest, then rows, slices
 # and frames, are the last bytes of PixelData.
 #
-# The orientation is not stated; it is that of SlicerHeart (DicomUltrasoundPlugin.py: an image
-# without origin or directions, which in 3D Slicer is RAS), so that landmarks from 3D Slicer fit.
-# ITK-SNAP (GuidedNativeImageIO.cxx) has the same origin, and opposite rows and slices.
+# The file does not state its orientation. SlicerHeart's is used (DicomUltrasoundPlugin.py: an image
+# without origin or directions, which 3D Slicer reads as RAS), so that landmarks from 3D Slicer fit.
+# ITK-SNAP (GuidedNativeImageIO.cxx) uses the same origin but opposite rows and slices.
 
 PHILIPS = "1.2.840.113543.6.6.1.3.10002"
 PHILIPS_DIRECTION = np.diag([-1.0, -1.0, 1.0])
@@ -248,7 +248,7 @@ def philips(path: Path) -> Opened:
     data: Any = pydicom.dcmread(path, force=True, defer_size=2**16)
 
     def number(name: str) -> float:
-        """A number, from its bytes if the file does not state its type."""
+        """A number; decoded from raw bytes if the file does not state its type."""
         key = (0x3001, int(name[6:10], 16)) if name.startswith("(") else name
         check(key in data, name, "not stated", "a number")
         value = data[key].value
@@ -275,7 +275,7 @@ def philips(path: Path) -> Opened:
     def load() -> Voxels:
         element = data["PixelData"]
         content, size = element.value, int(np.prod(shape, dtype=object))
-        # DICOM pads an odd number of bytes.
+        # DICOM pads data to an even number of bytes.
         end = len(content) - (1 if size % 2 and len(content) % 2 == 0 else 0)
         whole = end >= size and not element.is_undefined_length
         check(whole, "PixelData", f"{end} bytes", f"{size} bytes, not compressed")

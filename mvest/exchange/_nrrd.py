@@ -1,10 +1,9 @@
 """Headers and voxels of NRRD files, by pynrrd; runs in the child process.
 
-Format: https://teem.sourceforge.net/nrrd/format.html. 3D Slicer puts the axis of frames first
-(``kinds: list domain domain domain``) or last, and their times into ``axis N index values``
+Format: https://teem.sourceforge.net/nrrd/format.html. 3D Slicer puts the frame axis first
+(``kinds: list domain domain domain``) or last, and the frame times into ``axis N index values``
 (developer guide, "Sequences"). Lengths are mm unless ``space units`` states another unit, as in
-Slicer. ITK writes a volume over time as four axes of ``space dimension: 4`` without a space; it is
-LPS.
+Slicer. ITK writes a volume over time with ``space dimension: 4`` and no space; such files are LPS.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from mvest.exchange._images import (
 from mvest.typing import FloatArray
 
 MODALITY_KEY = "mvest.modality"
-"""Key of this package for the modality."""
+"""The key under which this package stores the modality."""
 TO_LPS = {
     "left-posterior-superior": (1.0, 1.0, 1.0),
     "right-anterior-superior": (-1.0, -1.0, 1.0),
@@ -45,7 +44,7 @@ SHORT = {
 }
 UNSTATED = ("", "???", "none")
 MAX_LINES = 1000
-"""Lines to skip; pynrrd also counts lines behind the end of a file."""
+"""Largest number of lines to skip; pynrrd keeps counting past the end of a file."""
 KINDS_OF_SPACE = ("domain", "space", *UNSTATED)
 KINDS_OF_FRAMES = ("list", "time", "range", "domain", *UNSTATED)
 IMAGE_NODE = "vtkMRMLScalarVolumeNode"
@@ -64,7 +63,7 @@ def nrrd_file(path: Path, head: bytes) -> Opened:
         fields = nrrd.read_header(list(dict.fromkeys(lines)))  # old writers repeat "space"
         kind = {key: fields[key] for key in ("type", "endian") if key in fields}
         if fields["encoding"].lower() in ("ascii", "text", "txt"):
-            kind["endian"] = "little"  # text has no order of bytes
+            kind["endian"] = "little"  # text has no byte order
         empty = {**kind, "encoding": "raw", "dimension": 1, "sizes": np.zeros(1, dtype=int)}
         dtype = nrrd.read_data(empty, io.BytesIO()).dtype
     except Exception as error:  # pynrrd fails in many ways on a damaged header
@@ -111,7 +110,7 @@ def nrrd_file(path: Path, head: bytes) -> Opened:
 
 
 def _words(fields: Mapping[str, Any], name: str) -> list[str]:
-    """A field with a word per axis, by default empty words."""
+    """A field with one word per axis; empty words if it is missing."""
     n = fields["dimension"]
     words = list(fields.get(name, [""] * n))
     check(len(words) == n, name, words, f"a word for each of {n} axes")
@@ -119,7 +118,7 @@ def _words(fields: Mapping[str, Any], name: str) -> list[str]:
 
 
 def _place(fields: dict[str, Any]) -> tuple[int | None, FloatArray, FloatArray]:
-    """The axis of frames, steps ``(3, 3)`` and origin ``(3,)`` in LPS, mm."""
+    """The frame axis, and the steps ``(3, 3)`` and origin ``(3,)`` in LPS, mm."""
     if fields.get("space dimension") == 4:
         fields.setdefault("space", "left-posterior-superior-time")
     space = str(required(fields, "space", f"one of {', '.join(TO_LPS)}"))
@@ -149,7 +148,7 @@ def _place(fields: dict[str, Any]) -> tuple[int | None, FloatArray, FloatArray]:
 
 
 def _times(fields: Mapping[str, Any], axis: int, count: int) -> tuple[str, FloatArray | None, str]:
-    """The field of the times of frames, the times if stated, and their unit."""
+    """The name of the field with the frame times, the times if stated, and their unit."""
     unit = _words(fields, "units")[axis]
     unit = "" if unit in UNSTATED else unit
     for field in (f"axis {number} index values" for number in (axis, 0, 3)):

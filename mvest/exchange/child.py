@@ -1,10 +1,10 @@
 """A child process with bounded memory and time that reads the files of users.
 
-Libraries allocate what a header claims, loop, or crash on damaged bytes. Such a file ends the
-child, and the caller gets an error in one line. One child serves all files of a process; it is
-started for the first file, and again after it died.
+On damaged bytes, libraries may allocate whatever a header claims, loop, or crash. Such a file ends
+the child, and the caller gets a one-line error. One child serves all files of a process; it starts
+with the first file, and again after a crash.
 
-A start takes 0.3 s, a call 1 ms, and an array of 100 MB 0.1 s.
+Starting takes 0.3 s, a call 1 ms, and passing 100 MB of arrays 0.1 s.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mvest.provenance import THREAD_VARIABLES
 from mvest.reading.text import MAX_LINE, one_line
 
 MEMORY_GB, SECONDS = 3.0, 60.0
-"""Limits of a call: GiB of address space on top of the bare process; s of CPU and wall time."""
+"""Limits of a call: GiB of address space beyond the bare process; s of CPU and wall time."""
 
 _lock = threading.Lock()
 _child: Program | None = None
@@ -46,16 +46,16 @@ def in_child(
     memory_gb: float = MEMORY_GB,
     seconds: float = SECONDS,
 ) -> Any:
-    """Return ``function(path, *arguments)``, computed in the child within limits.
+    """Compute ``function(path, *arguments)`` in the child, within limits.
 
-    The function is one of a module. It returns a tree of dict (keys are str), list, str, int,
-    float, bool, None and NumPy arrays of numbers; tuples become lists. JSON can hold the arguments.
+    The function is defined at module level. It returns a tree of dict (with str keys), list, str,
+    int, float, bool, None and numeric NumPy arrays; tuples become lists. Arguments must fit JSON.
 
     Raises
     ------
     MvestError
-        As the function raised it. An `InputError` if the file is missing, if the function raised
-        anything else, or if the child exceeded a limit or crashed. One line that names the file.
+        As raised by the function. An `InputError`, one line that names the file, if the file is
+        missing, the function raised anything else, or the child exceeded a limit or crashed.
     """
     global _child, _owner
     if not path.is_file():
@@ -98,7 +98,7 @@ def in_child(
         finally:
             timer.cancel()
             timer.join()
-        if late.is_set():  # the limit passed just after the answer
+        if late.is_set():  # the time limit passed just after the answer
             _child = None
             program.close()
     if "error" in answer:
@@ -132,7 +132,7 @@ def _write(stream: Any, tree: Any) -> None:
 
 
 def _read(stream: Any) -> Any:
-    """Read a tree that `_write` has written.
+    """Read a tree written by `_write`.
 
     Raises
     ------
@@ -158,17 +158,17 @@ def _read(stream: Any) -> Any:
         return exactly(size).view(dtype).reshape(shape)
 
     (size,) = struct.unpack("<q", exactly(8).tobytes())
-    # JSON objects are completed in the order of their ends, which is that of the bytes.
+    # The parser completes JSON objects in the order of their ends, the order of the array bytes.
     return json.loads(exactly(size).tobytes(), object_hook=whole)
 
 
 def main() -> None:
-    """Answer calls until the input is closed."""
+    """Answer calls until the input closes."""
     requests: BinaryIO = os.fdopen(os.dup(0), "rb")
     answers: BinaryIO = os.fdopen(os.dup(1), "wb")
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     nothing = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):  # libraries print messages about a file
+    for stream in (0, 1, 2):  # libraries print messages
         os.dup2(nothing, stream)
     with suppress(EOFError, KeyboardInterrupt):
         while True:
@@ -210,7 +210,7 @@ def _limited(what: int, amount: int) -> Iterator[None]:
 
 
 def _size() -> int:
-    """Bytes of address space of this process; 2 GiB if the system does not state it."""
+    """Address space of this process (bytes); 2 GiB if the system does not report it."""
     try:
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[0]
     except OSError:

@@ -1,7 +1,7 @@
-"""Points and curves of 3D Slicer: ``.mrk.json`` written and read, the older ``.fcsv`` read.
+"""Points and curves of 3D Slicer: reads and writes ``.mrk.json``, reads the older ``.fcsv``.
 
-Rules and defaults are those of the JSON schema ``markups-schema-v1.0.3.json`` of Slicer's module
-Markups and of its reader ``vtkMRMLMarkupsJsonStorageNode``. Positions here are LPS in mm.
+Rules and defaults follow the JSON schema ``markups-schema-v1.0.3.json`` of Slicer's Markups module
+and its reader ``vtkMRMLMarkupsJsonStorageNode``. Positions here are LPS in mm.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MAX_BYTES = 2**24
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointList:
-    """Points with their labels, which may be empty or repeated."""
+    """Labelled points; labels may be empty or repeated."""
 
     labels: tuple[str, ...]  # one per point
     points: FloatArray  # (n, 3) mm, LPS
@@ -55,7 +55,7 @@ def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
     Raises
     ------
     InputError
-        Another suffix, no lists, positions that are not finite, or a file that cannot be written.
+        The suffix differs, there are no lists, a position is not finite, or writing fails.
     """
     target = Path(path)
     if not target.name.endswith(".mrk.json") or not lists:
@@ -76,16 +76,16 @@ def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
 
 
 def read_markups(path: Path | str) -> dict[str, PointList]:
-    """Read lists of points, lines and curves by name (``.fcsv``, or JSON of Slicer's schema).
+    """Read lists of points, lines and curves by name (``.fcsv`` or Slicer's JSON).
 
-    A list without a name is named after the file, as in Slicer. Points without a position are in
+    A list without a name is named after the file, as in Slicer. Points without a position go to
     `PointList.unplaced`.
 
     Raises
     ------
     InputError
-        The file is missing or has neither format, an unknown system or unit of length, or a placed
-        point without three numbers.
+        The file is missing, has neither format, or has an unknown coordinate system or length unit,
+        or a placed point without three numbers.
     """
     source = Path(path)
     if source.suffix.lower() == ".fcsv":
@@ -118,7 +118,7 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_NUMBER
 
 
 class _Point(BaseModel):
-    """A control point; Slicer writes an empty text as position of one that was not placed."""
+    """A control point; Slicer writes an empty string as the position of an unplaced point."""
 
     id: Any = ""
     label: str = ""
@@ -133,7 +133,7 @@ class _Point(BaseModel):
 
 
 def _code(unit: Any) -> Any:
-    """The code of a unit that may be ``[code, "UCUM", meaning]``."""
+    """The code of a unit, which may be given as ``[code, "UCUM", meaning]``."""
     return unit[0] if isinstance(unit, list) and unit[1:2] == ["UCUM"] else unit
 
 

@@ -1,6 +1,6 @@
-"""Mesh files of other programs as VTK objects; runs in the child (`mvest.exchange.child`).
+"""Reads other programs' mesh files as VTK objects, in the child (`mvest.exchange.child`).
 
-VTK reads its own formats and OBJ, trimesh PLY and GLB. STL is read here, because VTK accepts
+VTK reads its own formats and OBJ; trimesh reads PLY and GLB. STL is read here, because VTK accepts
 truncated STL files.
 """
 
@@ -24,7 +24,7 @@ from mvest.typing import FloatArray, IntArray
 Arrays = Mapping[str, NDArray[np.generic]]
 POLYGONS = (5, 7, 9)
 FLAT = (1, 2, 3, 4, *POLYGONS)
-"""VTK's numbers of cell types; 1 and 2 are single vertices, 3 and 4 lines."""
+"""VTK's cell type numbers; 1 and 2 are single vertices, 3 and 4 are lines."""
 STL_HEADER = 84
 STL_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -100,7 +100,7 @@ def _triangles(
 
 
 def vtk_module(name: str) -> Any:
-    """One of VTK's modules, because importing all of them takes a second.
+    """Import one VTK module, because importing all of them takes a second.
 
     Raises a `ConfigurationError` if VTK is not installed.
     """
@@ -140,13 +140,13 @@ def polydata(
 
 
 def _of_triangles(points: NDArray[Any], corners: NDArray[Any]) -> Any:
-    """A vtkPolyData of points ``(n, 3)`` and triangles, or their concatenated corners."""
+    """A vtkPolyData of points ``(n, 3)`` and triangles (or their concatenated corners)."""
     flat = corners.ravel().astype(np.int64)
     return polydata(points.astype(np.float64), flat, np.full(len(flat) // 3, 3))
 
 
 def _arrays(data: Any) -> dict[str, Any]:
-    """Numeric arrays by name, and texts of one word."""
+    """Numeric arrays by name, and one-word strings."""
     result: dict[str, Any] = {}
     for number in range(data.GetNumberOfArrays()):
         array, name = data.GetAbstractArray(number), data.GetArrayName(number) or ""
@@ -159,11 +159,11 @@ def _arrays(data: Any) -> dict[str, Any]:
 
 
 def _vtk(path: Path, module: str, name: str) -> tuple[Any, list[str]]:
-    """Read by a VTK reader; its error messages are raised, also those that it calls warnings."""
+    """Read with a VTK reader; raise its error messages, including those it calls warnings."""
     errors: list[str] = []
 
     def listen(_window: object, event: str, text: str) -> None:
-        # "InformationKey": ranges of arrays, which may be infinite.
+        # "InformationKey" warns of array ranges, which may be infinite.
         if ("Error reading" in text or event == "ErrorEvent") and "InformationKey" not in text:
             errors.append(text)
 
@@ -178,7 +178,7 @@ def _vtk(path: Path, module: str, name: str) -> tuple[Any, list[str]]:
             getattr(reader, f"ReadAll{what}On")()
         content = path.read_bytes()
         if b"ASCII" in b"".join(content[:1024].upper().splitlines()[2:3]):
-            # VTK 9.7 invents numbers at the end of a truncated text, but not before a keyword.
+            # VTK 9.7 makes up numbers at the end of truncated text, but not before a keyword.
             reader.ReadFromInputStringOn()
             reader.SetInputString(content.decode("latin-1") + "\nFIELD end 0\n")
     reader.Update()
@@ -195,7 +195,7 @@ def _vtk(path: Path, module: str, name: str) -> tuple[Any, list[str]]:
 
 
 def _stl(path: Path) -> tuple[Any, list[str]]:
-    """An STL file. VTK accepts truncated ones, and refuses capitals."""
+    """Read an STL file. VTK accepts truncated files and rejects capitals."""
     content = path.read_bytes()
     count = int.from_bytes(content[80:STL_HEADER], "little")
     whole = STL_HEADER + count * STL_FACET.itemsize
@@ -214,7 +214,7 @@ def _stl(path: Path) -> tuple[Any, list[str]]:
 
 
 def _ply(path: Path) -> tuple[Any, list[str]]:
-    """The points and faces of a PLY file by trimesh, which accepts truncated text."""
+    """Read points and faces of a PLY file with trimesh, which accepts truncated text."""
     from trimesh.exchange.ply import load_ply
 
     content = path.read_bytes()
@@ -232,7 +232,7 @@ def _ply(path: Path) -> tuple[Any, list[str]]:
 
 
 def _glb(path: Path) -> tuple[Any, list[str]]:
-    """All objects of a scene, placed and named by its nodes (or else named by their meshes)."""
+    """All objects of a scene, placed by its nodes and named after nodes, or else meshes."""
     import trimesh
 
     content = path.read_bytes()
@@ -243,7 +243,7 @@ def _glb(path: Path) -> tuple[Any, list[str]]:
     if needed:
         words = ", ".join(needed)
         raise InputError(f"needs {words} of glTF; save it without compression or extensions")
-    # A stream without a name: arrays in other files are not followed.
+    # A stream has no file name, so references to other files are not followed.
     scene = trimesh.load_scene(
         io.BytesIO(content), file_type="glb", skip_materials=True, process=False
     )
@@ -257,7 +257,7 @@ def _glb(path: Path) -> tuple[Any, list[str]]:
             part.apply_transform(transform)
             faces.append(sum(map(len, points)) + np.asarray(part.faces))
             points.append(np.asarray(part.vertices, dtype=np.float64))
-            if part.metadata["from_gltf_primitive"]:  # one of several of its node
+            if part.metadata["from_gltf_primitive"]:  # one of several parts of a node
                 node = str(scene.graph.transforms.parents[node])
             names += [str(geometry) if node.isdecimal() else node] * len(part.faces)
     return _of_triangles(np.concatenate(points), np.concatenate(faces)), names

@@ -1,9 +1,9 @@
-"""Surfaces with their regions: VTK, STL, OBJ, PLY and GLB are read, VTP and time series written.
+"""Surfaces with regions: reads VTK, STL, OBJ, PLY and GLB, writes VTP and time series.
 
 A surface comes from one labelled file or from one file per region. STL, OBJ and PLY have no labels:
-``{anterior: a.stl, posterior: p.stl}``. Coincident vertices are merged in surfaces of several
-files, and in STL, OBJ and GLB files. The triangles number the merged vertices, so that two files
-with the same triangles in the same order correspond.
+``{anterior: a.stl, posterior: p.stl}``. Coincident vertices are merged in surfaces from several
+files, and in STL, OBJ and GLB files. Merged vertices are numbered in triangle order, so that two
+files with the same triangles in the same order correspond.
 """
 
 from __future__ import annotations
@@ -31,35 +31,35 @@ Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
 SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply", ".vtk", ".glb")
 MERGE_TOLERANCE = 1e-5
-"""Merge distance over the diagonal of the bounding box (0.5 µm on 50 mm)."""
+"""Merge distance relative to the bounding box diagonal (0.5 µm on 50 mm)."""
 MAX_TRIANGLES = 500_000
-"""Checking a case of two such frames takes 140 s and 1.2 GB; one of 55 000 triangles 15 s."""
+"""Checking a case of two frames of this size takes 140 s and 1.2 GB; 55 000 triangles take 15 s."""
 MAX_NEIGHBOURS = 100
-"""Largest mean number of vertices that are merged into one; unshared triangles have about six."""
+"""Largest mean number of vertices merged into one; about six if triangles share no vertices."""
 NAME_THEM = "name them anterior and posterior (also in place of AML, PML or Anterior)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A triangulated surface with the other contents of its file.
+    """A triangulated surface with the data of its file.
 
     Attributes
     ----------
     vertices
         ``(n, 3)`` in the unit of the file; finite.
     triangles
-        ``(m, 3)``, also from polygons.
+        ``(m, 3)``; polygons are split.
     point_data, cell_data
         Named arrays with n or m rows.
     groups
-        Name of the object of each triangle (GLB); empty without any.
+        Object name of each triangle (GLB); empty if there are none.
     region
-        ``(m,)`` index into the regions of a case; None without labels.
+        ``(m,)`` index into the case's regions; None without labels.
     others
-        Number of cells of each other type, by its name in VTK ("tetra", "wedge"), without single
-        vertices.
+        Number of cells of each other type, by VTK name ("tetra", "wedge"); single vertices are
+        not counted.
     space
-        "LPS" or "RAS", as 3D Slicer names the axes in a title, comment or field data; else None.
+        "LPS" or "RAS" if 3D Slicer named the axes in a title, comment or field data; else None.
     """
 
     vertices: FloatArray
@@ -101,7 +101,7 @@ def read_surface(path: Path | str) -> Surface:
     Raises
     ------
     InputError, GeometryError
-        As `read_mesh`; there are no triangles, or cells of other types.
+        As `read_mesh`; or there are no triangles, or there are cells of other types.
     """
     found = read_mesh(path)
     if found.others:
@@ -116,21 +116,21 @@ def read_surface(path: Path | str) -> Surface:
 def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -> Surface:
     """Read a surface and the region of each triangle.
 
-    The labels are, in this order, the keys of ``files``, the cell data ``region``, the point data
-    ``region`` (a triangle has the label of two of its corners), or the names of objects (GLB). A
-    single region needs no labels.
+    Labels come from the first of these that exists: the keys of ``files``, the cell data
+    ``region``, the point data ``region`` (a triangle takes the label that two corners share), the
+    object names (GLB). A single region needs no labels.
 
     Parameters
     ----------
     files
-        One file, or one for each name of a region.
+        One file, or one for each region name.
     regions
         Name of every label, in order.
 
     Raises
     ------
     InputError, GeometryError
-        A file is missing or damaged, labels are missing or unknown, a region has no triangles.
+        A file is missing or damaged, labels are missing or unknown, or a region has no triangles.
     """
     if isinstance(files, Path):
         with refusing(files, "surface"):
@@ -179,7 +179,7 @@ def merged(surface: Surface) -> Surface:
     n = len(surface.vertices)
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     tree, near = cKDTree(surface.vertices), MERGE_TOLERANCE * diagonal
-    # Far outliers make all other vertices coincident. Listing the pairs would need much memory.
+    # A far outlier makes all other vertices coincident, and listing the pairs takes much memory.
     if tree.count_neighbors(tree, near) > MAX_NEIGHBOURS * n:
         raise GeometryError(
             f"vertices lie within {near:.2g} of each other, {MERGE_TOLERANCE:g} of the surface's "
@@ -225,7 +225,7 @@ def _labels(surface: Surface, regions: Mapping[int, str]) -> IntArray | None:
 def _indices(
     labels: NDArray[np.generic], known: Mapping[Any, str], what: str, where: str
 ) -> IntArray:
-    """Labels as indices into the known ones, whose values describe them in an error."""
+    """Labels as indices into the known labels, whose values describe them in an error."""
     if labels.ndim != 1:
         raise InputError(f"{where} has {labels.shape[1]} components, expected one label")
     found, inverse = np.unique(labels, return_inverse=True)
@@ -262,7 +262,7 @@ def write_surface(
     Raises
     ------
     InputError, GeometryError
-        Another suffix, points that are not finite, or a file that cannot be written.
+        The suffix differs, a point is not finite, or the file cannot be written.
     """
     target = Path(path)
     _check_suffix(target, (".vtp",))
@@ -293,7 +293,7 @@ def write_surface(
 
 
 def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
-    """Cell data with the labels, and an indicator per region that carries its name."""
+    """Cell data: the labels, and one indicator array per region, named after it."""
     result: dict[str, NDArray[np.generic]] = {"region": region}
     for number, name in enumerate(names):
         result[f"region.{name}"] = (region == number).astype(np.int8)
@@ -305,7 +305,7 @@ def write_surface_series(
 ) -> Path:
     """Write surfaces over time (LPS) for ParaView and 3D Slicer.
 
-    The states ``NAME_0000.vtp``, ``NAME_0001.vtp``, ... lie next to their index ``NAME.pvd``.
+    The states ``NAME_0000.vtp``, ``NAME_0001.vtp``, ... are written next to the index ``NAME.pvd``.
 
     Raises as `write_surface`.
     """

@@ -1,10 +1,10 @@
-"""Volumes over time and label maps: reading every known format, writing ``.seq.nrrd``.
+"""Volumes over time and label maps: reads every supported format, writes ``.seq.nrrd``.
 
-The content of a file decides its format, not its name. Nothing is guessed: the caller must give
+The format is detected from a file's content, not its name. Nothing is guessed: the caller must give
 what the file does not state, and must not contradict what it states. The child process reads the
-file: first its header, then its voxels within a memory limit that follows from their number.
+file: first its header, then its voxels, within a memory limit set by the number of voxels.
 
-The bounds admit any 4D image of a heart and catch what is none: pixels in the wrong order,
+The bounds admit any 4D image of a heart and reject everything else: pixels in the wrong order,
 centimetres taken for millimetres, a mask, a localiser. A label map may be smaller and emptier than
 an image.
 """
@@ -42,15 +42,15 @@ from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
 
 MAX_BYTES = 4 * 2**30
-"""Largest decoded size of all frames: twenty frames of CT, 512 x 512 x 300 voxels of two bytes,
-have 2.9 GiB."""
+"""Largest decoded size of all frames. Twenty CT frames of 512 x 512 x 300 two-byte voxels take
+2.9 GiB."""
 MAX_UNCHECKED, MAX_RATIO = 2**28, 1000
-"""Decoded bytes that any file may have, and largest compression ratio beyond that: images of the
-heart have ratios of 1.5 to 20, label maps of some hundred."""
+"""Decoded bytes always allowed, and the largest compression ratio beyond that. Images of the heart
+have ratios of 1.5 to 20, label maps of a few hundred."""
 COPIES = 3
-"""Memory limit of reading, in copies of the voxels, on top of 1 GiB."""
+"""Memory limit for reading, in copies of the voxels, in addition to 1 GiB."""
 BYTES_PER_SECOND = 2**25
-"""Decoding rate of a slow machine; reading may take this time and a minute."""
+"""Decoding rate of a slow machine; reading may take that long plus a minute."""
 
 READABLE = "NRRD, MetaImage, NIfTI or Philips Cartesian DICOM"
 MAX_HEADER = 2**20
@@ -66,20 +66,20 @@ SECONDS_PER_UNIT = {
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.002, 1.0
 """Bounds of the interval between two frames of a beating heart, the upper one excluded.
 
-No scanner takes 500 volumes per second. One second is the default of many programs, and would leave
-one frame per beat. The bounds tell milliseconds from seconds.
+No scanner takes 500 volumes per second. One second is the default of many programs, and would
+leave one frame per beat. The bounds distinguish milliseconds from seconds.
 """
 SPACING_MM = (0.05, 5.0)
 """Voxel spacing; 3D echo has 0.3 to 1.5, CT 0.2 to 1, MR up to 5."""
 EXTENT_MM, LABELS_MM = (20.0, 500.0), (2.0, 500.0)
-"""Extent along each axis: of an image, from an annulus to a whole chest; of a label map, which may
+"""Extent along each axis: an image shows anything from an annulus to a whole chest; a label map may
 be cropped to the leaflets of a child."""
 MIN_VOXELS, MIN_LABELS = 16, 2
-"""Least number of voxels along each axis of an image, and of a label map."""
+"""Smallest number of voxels along each axis of an image, and of a label map."""
 MAX_OFFSET_MM = 1e4
 """Largest coordinate of the origin."""
 ORTHOGONAL = 1e-3
-"""Largest cosine between axes; files state them with three digits or more."""
+"""Largest cosine between axes; files give axes to three digits or more."""
 WRITABLE = ("uint8", "int16", "float32")
 
 
@@ -87,16 +87,16 @@ WRITABLE = ("uint8", "int16", "float32")
 class LabelMap:
     """Labelled voxels. World coordinates are LPS, in mm.
 
-    The columns of ``direction`` are the unit vectors of i, j and k; orthonormal, perhaps
+    The columns of ``direction`` are the unit vectors of i, j and k: orthonormal, possibly
     left-handed.
     """
 
-    frames: NDArray[np.integer]  # (F, I, J, K), over time, or the layers of a segmentation
-    is_layers: bool  # whether they are layers, which show one instant
+    frames: NDArray[np.integer]  # (F, I, J, K), F times, or layers of a segmentation
+    is_layers: bool  # whether F counts layers, all of one instant
     spacing: FloatArray  # (3,) mm
     direction: FloatArray  # (3, 3)
     origin: FloatArray  # (3,) mm, centre of voxel (0, 0, 0)
-    segments: tuple[Segment, ...]  # that a ``.seg.nrrd`` names; empty for other files
+    segments: tuple[Segment, ...]  # named in a ``.seg.nrrd``; empty for other files
 
 
 def read_volume(
@@ -114,17 +114,17 @@ def read_volume(
         NRRD (``.nrrd``, ``.seq.nrrd``, ``.nhdr``), MetaImage (``.mha``, ``.mhd``), NIfTI (``.nii``,
         ``.nii.gz``) or Philips Cartesian DICOM.
     modality
-        Required unless the file states it: DICOM, and files of this package.
+        Required unless the file states it, as DICOM and files written by this package do.
     frame_interval_s
-        Seconds between frames, for files that state no times in a unit of time.
+        Seconds between frames, for files that give no times in a unit of time.
     time_unit
-        ``"s"`` or ``"ms"``, for files that state times without a unit.
+        ``"s"`` or ``"ms"``, for files that give times without a unit.
 
     Raises
     ------
     InputError
-        The file is damaged or of another kind, does not state something, contradicts an argument,
-        or is no plausible image of a heart.
+        The file is damaged, has an unsupported format, lacks required information, contradicts an
+        argument, or is not a plausible image of a heart.
     """
     source = Path(path)
     if source.is_dir():
@@ -143,7 +143,7 @@ def read_labels(path: Path | str) -> LabelMap:
     Raises
     ------
     InputError
-        As `read_volume`; an image, no labels, or values that are not whole numbers.
+        As `read_volume`; or the file is an image, has no labels, or has non-integer values.
     """
     found = _read(Path(path), True)
     del found["sha256"]
@@ -151,7 +151,7 @@ def read_labels(path: Path | str) -> LabelMap:
 
 
 def sequence_path(path: Path | str) -> Path:
-    """The path; raises an InputError unless it ends in ``.seq.nrrd``."""
+    """Return the path; raise an InputError unless it ends in ``.seq.nrrd``."""
     target = Path(path)
     if not target.name.endswith(".seq.nrrd") or target.name == ".seq.nrrd":
         raise InputError(f"{target}: name {target.name!r}, expected one that ends in .seq.nrrd")
@@ -159,15 +159,15 @@ def sequence_path(path: Path | str) -> Path:
 
 
 def write_sequence_nrrd(path: Path | str, sequence: VolumeSequence) -> Path:
-    """Write a volume of uint8, int16 or float32 over time to a file that ends in ``.seq.nrrd``.
+    """Write a volume over time (uint8, int16 or float32) to a ``.seq.nrrd`` file.
 
-    The same content gives the same bytes. The axis of frames comes first, which all versions of
-    Slicer read.
+    Equal content gives equal bytes. The frame axis comes first; all versions of Slicer can read
+    that order.
 
     Raises
     ------
     InputError
-        Another name or type, or a file that cannot be written.
+        The name or voxel type is not supported, or the file cannot be written.
     """
     target = sequence_path(path)
     if (found := sequence.frames.dtype.name) not in WRITABLE:
@@ -189,13 +189,13 @@ def write_sequence_nrrd(path: Path | str, sequence: VolumeSequence) -> Path:
     content = io.BytesIO()
     nrrd.write(content, sequence.frames, header, compression_level=1)
     head, end, voxels = content.getvalue().partition(b"\n\n")
-    # pynrrd writes the time into comments.
+    # pynrrd writes the current time into comments.
     lines = [line for line in head.split(b"\n") if not line.startswith(b"#")]
     return write_atomically(target, b"\n".join(lines) + end + voxels)
 
 
 def files_of_volume(path: Path) -> dict[str, Path]:
-    """Files that reading a volume opens, by name: itself, and its data file if it has one."""
+    """Files opened to read a volume, by name: the file itself, and its data file if any."""
     try:
         files = _files(path, in_child(data_file_of, path))
     except InputError:
@@ -235,9 +235,9 @@ def describe(
     frame_interval_s: float | None = None,
     time_unit: str | None = None,
 ) -> dict[str, Any]:
-    """The checked header of an image or label map: fields of the result without the voxels.
+    """The checked header of an image or label map: all fields of the result except the voxels.
 
-    ``bytes`` (of the decoded voxels) and ``data_file`` are added.
+    Also contains ``bytes`` (decoded size of the voxels) and ``data_file``.
     """
     stated, _ = _opened(path)
     result = _common(stated, labels)
@@ -276,7 +276,7 @@ def read_voxels(path: Path, labels: bool) -> Voxels:
 
 
 def data_file_of(path: Path) -> str:
-    """Name of a separate file with the voxels, or an empty text."""
+    """Name of a separate file with the voxels, or an empty string."""
     return _opened(path)[0].data_file
 
 
@@ -299,7 +299,7 @@ def _opened(path: Path) -> Opened:
 
 
 def _common(stated: Stated, labels: bool) -> dict[str, Any]:
-    """Checked geometry of a volume, the bytes of its voxels, and the name of its data file."""
+    """Checked geometry of a volume, decoded size of its voxels, and name of its data file."""
     min_voxels, extent_mm = (MIN_LABELS, LABELS_MM) if labels else (MIN_VOXELS, EXTENT_MM)
     (size, place, origin, values, _), shape = stated.names, stated.shape
     counted = f"{' x '.join(map(str, shape))} frames and voxels"
@@ -324,7 +324,7 @@ def _common(stated: Stated, labels: bool) -> dict[str, Any]:
     check(fits, place, f"a volume of {_words(extent)} mm", expected.format(*extent_mm))
     near = (np.abs(stated.origin) <= MAX_OFFSET_MM).all()
     check(near, origin, _words(stated.origin), f"coordinates in mm within {MAX_OFFSET_MM:g}")
-    # The closest orthonormal axes remove rounding errors of the file and keep the handedness.
+    # The closest orthonormal axes remove the file's rounding errors and preserve handedness.
     left, _, right = np.linalg.svd(axes)
     return {
         "spacing": spacing,
@@ -340,7 +340,7 @@ def _words(values: FloatArray) -> str:
 
 
 def _times(stated: Stated, frame_interval_s: float | None, time_unit: str | None) -> FloatArray:
-    """Times ``(F,)`` s of the frames; a single frame without a time is at 0."""
+    """Frame times ``(F,)`` s; a single frame without a time gets 0."""
     field, count, given = stated.names[4], stated.shape[0], stated.times
     unit = SECONDS_PER_UNIT.get(stated.unit.lower())
     if frame_interval_s is not None:

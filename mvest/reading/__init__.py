@@ -1,1 +1,1 @@
-"""Readers of text, tables, documents and arrays of users, within bounds of size."""
+"""Readers with size limits for users' text, tables, documents and arrays."""

@@ -1,8 +1,8 @@
-"""JSON and YAML files as plain data: mappings, lists, text and finite numbers, of bounded size.
+"""Reads JSON and YAML files of bounded size as mappings, lists, text and finite numbers.
 
 YAML tags (which create objects), aliases (which let a short text grow without bound), repeated keys
-and deep nesting are refused. Only decimal numbers are numbers; hexadecimal, octal and sexagesimal
-ones, those with underscores, and dates are text.
+and deep nesting raise an error. Only decimal literals are numbers; hexadecimal, octal and
+sexagesimal literals, those with underscores, and dates are text.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def read_mapping(path: Path, max_size: int = MAX_TEXT, where: str = "") -> dict[str, Any]:
-    """The mapping in a JSON file; ``where`` is its name in errors, by default its path.
+    """Read the mapping in a JSON file; ``where`` names it in errors (default: its path).
 
     Raises
     ------
@@ -38,7 +38,7 @@ def read_mapping(path: Path, max_size: int = MAX_TEXT, where: str = "") -> dict[
 
 
 def validated(schema: type[M], data: Any, where: str) -> M:
-    """Plain data as an instance of a schema; ``where`` names them in an error.
+    """Convert plain data to an instance of a schema; ``where`` names the data in errors.
 
     Raises
     ------
@@ -54,17 +54,17 @@ def validated(schema: type[M], data: Any, where: str) -> M:
 
 
 def parse_json(content: bytes | str, where: str) -> Any:
-    """The data in a text of JSON; ``where`` names it in an error.
+    """Parse JSON text; ``where`` names it in errors.
 
     Raises
     ------
     InputError
-        The text is no JSON, or holds NaN, an infinity, or half of a surrogate pair.
+        The text is not JSON, or contains NaN, an infinity, or half of a surrogate pair.
     """
     try:
         text = content if isinstance(content, str) else content.decode("utf-8-sig")
         data = json.loads(text)
-        # Python reads NaN, 1e999 and halves of surrogate pairs, but does not write them.
+        # Python reads NaN, 1e999 and halves of surrogate pairs, but cannot write them.
         json.dumps(data, ensure_ascii=False, allow_nan=False).encode()
         return data
     except (ValueError, RecursionError) as fault:
@@ -72,7 +72,7 @@ def parse_json(content: bytes | str, where: str) -> Any:
 
 
 MAX_FILE_SIZE = 1_000_000
-"""Bytes of a YAML file; a case has a few thousand."""
+"""Largest YAML file (bytes); a case has a few thousand."""
 MAX_DEPTH = 20
 MAX_VALUES = 50_000
 """Largest number of values; a case with a dozen lists of vertices has a few thousand."""
@@ -127,8 +127,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        The file is missing, too large, or no YAML mapping; it has tags, aliases, repeated keys,
-        deep nesting, or text or numbers beyond the bounds.
+        The file is missing, too large, or not a YAML mapping; or it has tags, aliases, repeated
+        keys, deep nesting, or text or numbers beyond the bounds.
     """
     text = read_text(path, MAX_FILE_SIZE)
     try:
@@ -137,7 +137,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except InputError as fault:
         raise InputError(f"{path}: {fault}") from fault
     except (yaml.YAMLError, ValueError) as fault:
-        # ValueError: an escape that is no character.
+        # ValueError: an invalid escape.
         raise InputError(f"{path}: no valid YAML: {one_line(fault, 160)}") from fault
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds a {type(data).__name__}, expected a mapping of fields")
@@ -145,7 +145,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _check_events(events: Iterator[Any]) -> None:
-    """Refuse content that may grow without bound, before anything is built."""
+    """Reject content that may grow without bound, before building anything."""
     depth = 0
     for count, event in enumerate(events):
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:

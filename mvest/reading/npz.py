@@ -1,4 +1,4 @@
-"""Reading NumPy's ``.npz``: plain arrays whose stated sizes are checked before any is made."""
+"""Reads plain arrays from NumPy's ``.npz``; checks the stated sizes before allocating any."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from mvest.errors import InputError
 from mvest.reading.text import one_line
 
 MAX_BYTES = 2**29
-"""Largest decoded size of the arrays that are read from one file."""
+"""Largest decoded size of the arrays read from one file."""
 KINDS = "biufSU"
-"""Kinds of numbers and text."""
+"""NumPy kinds of numbers and text."""
 
 _DAMAGE = (
     *(OSError, ValueError, LookupError, EOFError, RuntimeError, ArithmeticError, TypeError),
     *(SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
 )
-"""Exceptions of ``zipfile``, ``zlib`` and NumPy for damaged files."""
+"""Exceptions that ``zipfile``, ``zlib`` and NumPy raise for damaged files."""
 
 
 def read_npz(
@@ -35,24 +35,24 @@ def read_npz(
     optional: Sequence[str] = (),
     where: str = "",
 ) -> dict[str, NDArray[Any]]:
-    """The arrays in a file, without pickled objects, in the byte order of the machine.
+    """Read the arrays in a file, in native byte order; pickled objects are errors.
 
     Parameters
     ----------
     path : Path or binary stream
     names : sequence of str, optional
-        Required arrays; only these are read. By default all are.
+        Required arrays; only these are read. By default all arrays are read.
     exact : bool
-        Whether other arrays are refused.
+        Whether other arrays raise an error.
     optional : sequence of str
-        Further arrays to read if they are there.
+        Further arrays to read if present.
     where : str
         Name of the file in errors; its path by default.
 
     Raises
     ------
     InputError
-        The file is missing or damaged, lacks an array or holds others, or states more than
+        The file is missing or damaged, lacks an array or has others, or declares more than
         `MAX_BYTES`.
     """
     where = where or str(path)
@@ -87,7 +87,7 @@ def read_npz(
 
 
 def _plain(array: Any, where: str) -> NDArray[Any]:
-    # A member without NumPy's header comes as bytes. An array without bytes may state any length.
+    # NumPy returns members without its header as bytes. An empty array may declare any length.
     plain = isinstance(array, np.ndarray) and array.dtype.kind in KINDS and array.dtype.itemsize
     if not plain or max(array.shape, default=0) > MAX_BYTES:
         raise InputError(f"{where}: expected a plain array of numbers or text")
@@ -102,14 +102,14 @@ def _plain(array: Any, where: str) -> NDArray[Any]:
 def check_array(
     array: NDArray[Any], where: str, kind: str, shape: Sequence[int | None]
 ) -> NDArray[Any]:
-    """An array as text (kind U), 64-bit integers (i) or finite numbers (f), of a given shape.
+    """Convert an array to text (kind U), 64-bit integers (i) or finite numbers (f) of a shape.
 
-    A length of None fits any. ``where`` names the array in errors.
+    A length of None matches any. ``where`` names the array in errors.
 
     Raises
     ------
     InputError
-        Another kind or shape, or numbers that are not finite.
+        The kind or shape differs, or a number is not finite.
     """
     sizes = zip(shape, array.shape, strict=False)
     fits = array.ndim == len(shape) and all(want in (None, have) for want, have in sizes)

@@ -1,4 +1,4 @@
-"""Bytes, text, numbers and small comma-separated tables of other programs, within bounds."""
+"""Reads bytes, text, numbers and small comma-separated tables from users, within bounds."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mvest.typing import FloatArray, IntArray
 MAX_TEXT = 2**26
 """Default largest size of a text file (bytes)."""
 MAX_NUMBER = 1e9
-"""Largest magnitude of any number of a user, in any unit."""
+"""Largest magnitude of any user-supplied number, in any unit."""
 MAX_LINE = 300
 """Longest message about a file (characters)."""
 MAX_WORDS = 20_000
-"""Longest text of a user (characters)."""
+"""Longest user-supplied text (characters)."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,5})?", re.ASCII)
 _MAX_DIGITS = 400
@@ -31,12 +31,12 @@ _UNWRITABLE = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\uff
 
 
 def read_bytes(path: Path, max_size: int = MAX_TEXT, where: str = "") -> bytes:
-    """The content of a file; ``where`` is its name in errors, by default its path.
+    """Read a file; ``where`` names it in errors (default: its path).
 
     Raises
     ------
     InputError
-        It is missing, not a regular file, not readable, or larger than ``max_size`` bytes.
+        The file is missing, irregular, not readable, or larger than ``max_size`` bytes.
     """
     where = where or str(path)
     try:
@@ -57,12 +57,12 @@ def read_bytes(path: Path, max_size: int = MAX_TEXT, where: str = "") -> bytes:
 
 
 def read_text(path: Path, max_size: int = MAX_TEXT, where: str = "") -> str:
-    """The content of a UTF-8 file, with or without a byte order mark.
+    """Read a UTF-8 file, with or without a byte order mark.
 
     Raises
     ------
     InputError
-        As `read_bytes`, or other than UTF-8.
+        As `read_bytes`, or the file is not UTF-8.
     """
     try:
         return read_bytes(path, max_size, where).decode("utf-8-sig")
@@ -71,12 +71,12 @@ def read_text(path: Path, max_size: int = MAX_TEXT, where: str = "") -> str:
 
 
 def number(text: str, max_abs: float = MAX_NUMBER) -> float:
-    """A finite decimal number, without underscores, hexadecimal or sexagesimal digits.
+    """Parse a finite decimal number; underscores, hexadecimal and sexagesimal digits are errors.
 
     Raises
     ------
     InputError
-        The text is none, or its magnitude exceeds ``max_abs``.
+        The text is not such a number, or its magnitude exceeds ``max_abs``.
     """
     plain = text.strip()
     value = float(plain) if len(plain) <= _MAX_DIGITS and _NUMBER.fullmatch(plain) else math.nan
@@ -87,13 +87,13 @@ def number(text: str, max_abs: float = MAX_NUMBER) -> float:
 
 
 def check_words(text: str, max_length: int = MAX_WORDS) -> str:
-    """The text, if all output formats can hold it.
+    """Return the text if all output formats can represent it.
 
     Raises
     ------
     InputError
-        It has control characters other than line ends and tabs, halves of surrogate pairs, or more
-        than ``max_length`` characters.
+        The text has control characters other than line ends and tabs, halves of surrogate pairs, or
+        more than ``max_length`` characters.
     """
     if len(text) > max_length:
         raise InputError(f"{len(text)} characters, expected at most {max_length}")
@@ -104,7 +104,7 @@ def check_words(text: str, max_length: int = MAX_WORDS) -> str:
 
 
 def one_line(text: object, max_length: int = MAX_LINE) -> str:
-    """A text in one line of bounded length that any terminal can show."""
+    """Convert an object to one line of bounded length that any terminal can show."""
     words = " ".join(str(text)[: 4 * max_length].split())
     line = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in words)
     return line if len(line) <= max_length else line[: max_length - 3] + "..."
@@ -112,7 +112,7 @@ def one_line(text: object, max_length: int = MAX_LINE) -> str:
 
 @contextmanager
 def refusing(path: Path, what: str) -> Iterator[None]:
-    """Turn every exception into an error of this package, in one line that names the file.
+    """Turn every exception into a one-line error of this package that names the file.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def refusing(path: Path, what: str) -> Iterator[None]:
 
 @contextmanager
 def named(*places: object) -> Iterator[None]:
-    """Prepend the first place to the errors of this package that begin with none of them."""
+    """Prepend the first place to errors of this package that begin with none of the places."""
     try:
         yield
     except MvestError as fault:
@@ -140,15 +140,15 @@ def named(*places: object) -> Iterator[None]:
 
 
 def read_columns(file: Path, names: Sequence[str], where: str = "") -> dict[str, list[str]]:
-    """Columns of a table by name, as text; the file has them in any order.
+    """Read columns of a table by name, as text; the file may have them in any order.
 
-    ``where`` is the name of the file in errors, by default its path.
+    ``where`` names the file in errors (default: its path).
 
     Raises
     ------
     InputError
-        The file cannot be read or is no text, has another header or no rows, or a row is too short
-        or too long.
+        The file is unreadable or not text, its header is wrong, it has no rows, or a row is too
+        short or too long.
     """
     where = where or str(file)
     text = read_text(file, where=where)
@@ -175,7 +175,7 @@ def read_columns(file: Path, names: Sequence[str], where: str = "") -> dict[str,
 def numbers(
     where: Path | str, name: str, cells: Sequence[str], max_abs: float = MAX_NUMBER
 ) -> FloatArray:
-    """A column as finite numbers."""
+    """Convert a column to finite numbers."""
     result = np.empty(len(cells))
     for row, cell in enumerate(cells):
         try:
@@ -188,14 +188,14 @@ def numbers(
 def read_numbers(
     file: Path, names: Sequence[str], max_abs: float = MAX_NUMBER, where: str = ""
 ) -> FloatArray:
-    """A table of finite numbers, ``(rows, columns)`` in the order of ``names``: `read_columns`."""
+    """Read a table of finite numbers ``(rows, columns)``, in the order of ``names``."""
     columns = read_columns(file, names, where)
     cells = [numbers(where or str(file), name, columns[name], max_abs) for name in names]
     return np.column_stack(cells)
 
 
 def indices(file: Path, name: str, cells: Sequence[str]) -> IntArray:
-    """A column as numbers from 0."""
+    """Convert a column to indices, counted from 0."""
     for row, cell in enumerate(cells):
         if not (cell.isascii() and cell.isdigit() and len(cell) < 10):
             raise InputError(f"{file}: {name} of row {row} is {cell[:40]!r}, expected 0, 1, 2, ...")
@@ -203,12 +203,12 @@ def indices(file: Path, name: str, cells: Sequence[str]) -> IntArray:
 
 
 def read_vertices(file: Path) -> IntArray:
-    """The only column ``vertex`` of a table."""
+    """Read a table whose only column is ``vertex``."""
     return indices(file, "vertex", read_columns(file, ["vertex"])["vertex"])
 
 
 def write_columns(file: Path, names: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table; numbers keep all digits.
+    """Write a table; numbers are written with all digits.
 
     Raises
     ------

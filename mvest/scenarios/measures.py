@@ -1,10 +1,10 @@
-r"""Measures of a closing valve, step by step, and of a closed one.
+r"""Measures of a closing valve, step by step, and of a closed valve.
 
 With the right stretch :math:`U = \sqrt{I + 2E}` and the second Piola-Kirchhoff stress :math:`S` the
 Cauchy stress is :math:`\sigma = F S F^T / \det F = R \, (U S U / \det U) \, R^T` (Holzapfel 2000,
 Nonlinear Solid Mechanics, equation 3.65, with :math:`F = R U`), so that its principal values are
-those of :math:`U S U / \det U`. Taken from the Green-Lagrange strain rather than from F, they
-include the enhanced strain of solid-shells, which no displacement has.
+those of :math:`U S U / \det U`. Computed from the Green-Lagrange strain rather than from F, they
+include the enhanced strain of solid-shells, which is not part of F.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ def measure_steps(
     Returns
     -------
     list of dict
-        For each step ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening between the
-        thick leaflets along the best annulus normal; ``coaptation`` (mm), the height in the middle
-        of the valve over which the leaflets are within the contact distance; ``intersections``,
-        pairs of intersecting triangles of the leaflets' faces; the largest ``chord strain`` and
-        ``chord force`` (N); ``smallest det F`` of the quadrature points; ``Newton iterations``.
+        For each step: ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening between the
+        thick leaflets along the best annulus normal; ``coaptation`` (mm), the height at mid-valve
+        over which the leaflets are within the contact distance; ``intersections``, pairs of
+        intersecting triangles of the leaflets' faces; the largest ``chord strain`` and ``chord
+        force`` (N); ``smallest det F`` at the quadrature points; ``Newton iterations``.
     """
     valve, system, simulation = model.valve, result.system, result.simulation
     surface, mesh = valve.surface, model.mesh
@@ -98,7 +98,7 @@ def measure_steps(
 
 
 _PLACE = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
-"""Places of tensor components in a six-vector 11, 22, 33, 23, 13, 12."""
+"""Index of each tensor component in the six-vector 11, 22, 33, 23, 13, 12."""
 
 
 def principal_cauchy(green: FloatArray, stress: FloatArray) -> FloatArray:
@@ -120,17 +120,17 @@ def principal_cauchy(green: FloatArray, stress: FloatArray) -> FloatArray:
 
 
 def _stress(system: System, x: FloatArray) -> FloatArray:
-    """First principal Cauchy stress ``(e, q)`` MPa at the points of quadrature."""
+    """First principal Cauchy stress ``(e, q)`` MPa at the quadrature points."""
     solid = system.solid
     state = solid.evaluate(x, solid.initial_strain(), 0.0)
     return principal_cauchy(state.green, state.stress)
 
 
 def peak_stress(system: System, x: FloatArray) -> Measured:
-    """Peak stress of each region in equilibrium, as `Measured` names it; volumes are at rest.
+    """Peak stress of each region in equilibrium, named as in `Measured`; volumes are at rest.
 
-    The largest occurs at the insertion of a chord or at the hinge, and grows as the mesh is
-    refined; the percentiles much less so.
+    The largest stress occurs at a chordal insertion or at the hinge, and grows with mesh
+    refinement; the percentiles grow much less.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def peak_stress(system: System, x: FloatArray) -> Measured:
     Raises
     ------
     InputError
-        If an element is turned inside out.
+        If an element is inverted.
     """
     values, mesh = _stress(system, x), system.solid.mesh
     if not np.isfinite(values).all():
@@ -186,13 +186,13 @@ def contact_pressure(system: System, x: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 Measured = dict[str, float]
-"""Name with its unit -> number.
+"""Name (including the unit) -> number.
 
-* ``gap_mm2``: regurgitant gap, the area within the annulus of the lines of sight along its normal
-  that stay farther than half the contact reach from every leaflet's midsurface;
-* ``coaptation_length_mm``: length over which the leaflets touch (midsurfaces within the contact
-  reach) in the middle anteroposterior section, the smaller of both;
-* ``coaptation_area_mm2``: area over which the leaflets touch, mean of both;
+* ``gap_mm2``: regurgitant gap, the area within the annulus where lines of sight along its normal
+  stay farther than half the contact reach from every leaflet's midsurface;
+  * ``coaptation_length_mm``: length over which the leaflets touch (midsurfaces within the contact
+  reach) in the middle anteroposterior section, the smaller of the two leaflets' values;
+  * ``coaptation_area_mm2``: area over which the leaflets touch, mean of the two leaflets;
 * ``coaptation_height_mm``: that area over the commissural diameter, the mean height of the touching
   zone across the valve;
 * ``tenting_height_mm``: largest depth of the leaflets below the annulus plane in the middle
@@ -205,14 +205,14 @@ Measured = dict[str, float]
 """
 
 NEVER_NEGATIVE = ("gap_", "coaptation_", "ap_diameter_", "annulus_", "stress_")
-"""Beginnings of names of measures that are never negative: areas, lengths, and the highest tension
-of a leaflet under pressure."""
+"""Name prefixes of measures that are never negative: areas, lengths, and the highest tension of a
+leaflet under pressure."""
 
 
 def measure_closed(model: ClosureModel, system: System, x: FloatArray) -> Measured:
-    """Measure one closed valve of two leaflets.
+    """Measure one closed two-leaflet valve.
 
-    ``system`` is the model's, set to the parameters at which ``x (n, 3)`` mm is in equilibrium.
+    ``system`` is the model's, at the parameters for which ``x (n, 3)`` mm is in equilibrium.
     """
     valve, surface = model.valve, model.valve.surface
     vertices = model.observed(x)

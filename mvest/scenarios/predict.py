@@ -1,4 +1,4 @@
-"""Prediction of one scenario at the estimate and at samples of its posterior."""
+"""Predicts one scenario at the estimate and at samples of its posterior."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from mvest.typing import FloatArray
 
 
 def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
-    """Samples ``(count, p)`` of the parameters' posterior.
+    """Draw samples ``(count, p)`` from the parameters' posterior.
 
-    A scrambled Sobol sequence (Owen 1998, J. Complexity 14:466), transformed to the normal
+    Uses a scrambled Sobol sequence (Owen 1998, J. Complexity 14:466), transformed to the normal
     distribution in filter coordinates.
 
     Parameters
@@ -50,7 +50,7 @@ NORMAL_95 = 1.959963984540054
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """Measures of one closed valve; empty if the valve does not close, with the reason."""
+    """Measures of one closed valve; empty, with a reason, if the valve does not close."""
 
     measures: Measured
     reason: str = ""
@@ -66,8 +66,8 @@ class PredictedScenario:
 
     at_estimate: Sample
     shape: FloatArray | None  #: ``(n, 3)`` mm, observed vertices at the estimate
-    samples: tuple[Sample, ...]  #: of the posterior, including failed ones
-    finer: Sample | None = None  #: the same valve at the estimate on a finer mesh, if there is one
+    samples: tuple[Sample, ...]  #: from the posterior, including failed ones
+    finer: Sample | None = None  #: the same valve at the estimate on a finer mesh, if computed
 
     @property
     def failures(self) -> tuple[str, ...]:
@@ -75,7 +75,7 @@ class PredictedScenario:
         return tuple(sample.reason for sample in self.samples if not sample.measures)
 
     def spread(self, name: str) -> dict[str, float]:
-        """Statistics of a measure over the samples; failed samples are left out.
+        """Statistics of a measure over the samples that did not fail.
 
         Returns
         -------
@@ -93,21 +93,21 @@ class PredictedScenario:
         return {"mean": mean, "std": std, "low": low, "high": high, "samples": len(known)}
 
     def mesh_error(self, name: str) -> float:
-        """Difference of a measure from that of the finer mesh; NaN without one.
+        """Difference between a measure and its value on the finer mesh; NaN without one.
 
-        It is used as the standard deviation of the mesh's error [choice]. Roache's grid convergence
-        index for two meshes (1994, J. Fluids Eng. 116:405) is stricter: with its safety factor of
-        3, a refinement ratio of 1.65 and second order, 4.7 differences instead of the 1.96 of
-        `interval`.
+        The difference is used as the standard deviation of the mesh error [choice]. Roache's grid
+        convergence index for two meshes (1994, J. Fluids Eng. 116:405) is stricter: with its safety
+        factor of 3, a refinement ratio of 1.65 and second order it gives 4.7 differences, where
+        `interval` uses 1.96.
         """
         finer = float("nan") if self.finer is None else self.finer.get(name)
         return abs(finer - self.at_estimate.get(name))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval of a measure with the error of the mesh; NaN if that is unknown.
+        """95 % interval of a measure including the mesh error; NaN if that error is unknown.
 
-        To either side of the estimate, the distance to the samples' quantile and 1.96 mesh errors
-        are combined as independent errors. Measures in `NEVER_NEGATIVE` stay non-negative.
+        On each side of the estimate, the distance to the samples' quantile and 1.96 mesh errors are
+        combined as independent errors. Measures in `NEVER_NEGATIVE` stay non-negative.
         """
         spread, error = self.spread(name), NORMAL_95 * self.mesh_error(name)
         centre = self.at_estimate.get(name)
@@ -118,13 +118,13 @@ class PredictedScenario:
         return float(low), float(high)
 
     def against(self, own: Sample, same: Sample) -> dict[str, dict[str, float | bool | None]]:
-        """Every measure compared with that of the true valve.
+        """Compare every measure with that of the true valve.
 
         Parameters
         ----------
         own, same : Sample
-            With the true parameters on a mesh of its own, and on the mesh of the estimate, where
-            only the parameters are uncertain.
+            The true parameters' valve on its own mesh, and on the estimator's mesh, where only the
+            parameters are uncertain.
 
         Returns
         -------
@@ -162,7 +162,7 @@ class PredictedScenario:
 def closed_valve(
     model: ClosureModel, m: FloatArray, *, sensitivities: bool = False
 ) -> tuple[Sample, FloatArray | None]:
-    """Measures of a closed valve, and its observed vertices ``(n, 3)`` mm; None if it fails."""
+    """Measures of a closed valve, and its observed vertices ``(n, 3)`` mm, or None on failure."""
     try:
         result = model.close(m, sensitivities=sensitivities)
     except MaterialError as error:
@@ -186,15 +186,15 @@ def predict_scenario(
     Parameters
     ----------
     model : ClosureModel
-        Under the scenario. With ``continuation`` every sample is reached from the closed valve at
-        the estimate.
+        The model under the scenario. With ``continuation``, every sample is continued from the
+        closed valve at the estimate.
     estimate : Estimate
     samples : ndarray
         ``(k, p)`` of its posterior.
     on_sample : callable, optional
-        Called with the number of each finished sample, for progress.
+        Called with the number of each finished sample, to show progress.
     finer : ClosureModel, optional
-        The same on a finer mesh, closed once at the estimate, for the error of the mesh.
+        The same model on a finer mesh, closed once at the estimate, for the mesh error.
 
     Raises
     ------
@@ -206,12 +206,12 @@ def predict_scenario(
             f"the estimate is of {', '.join(estimate.names)}, the model has "
             f"{', '.join(model.names)}"
         )
-    # Its derivatives predict the equilibria of the samples.
+    # The derivatives predict the equilibria of the samples.
     first, shape = closed_valve(model, estimate.mean, sensitivities=True)
     start = model.closed
     predicted = []
     for number, m in enumerate(samples):
-        # Each from the same start, so that no sample depends on the one before.
+        # All samples have the same start, so that none depends on the previous one.
         model.restart(start)
         predicted.append(closed_valve(model, m)[0])
         if on_sample is not None:

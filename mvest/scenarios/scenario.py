@@ -20,15 +20,15 @@ from mvest.valve.geometry.proximity import plane_section
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
 
 NARROWEST = 0.3
-"""Smallest share of the anteroposterior diameter that a ring may leave."""
+"""Smallest fraction of the anteroposterior diameter that a ring may leave."""
 
 
 @dataclass(frozen=True, slots=True)
 class Annuloplasty:
     """A ring that narrows the annulus of the closed valve from anterior to posterior.
 
-    Every annulus point is moved along the anterior direction towards the commissural line (through
-    the centre of the annulus, along the commissures), in proportion to its distance from it:
+    Each annulus point moves along the anterior direction towards the commissural line (through the
+    annulus centre, along the commissures), in proportion to its distance from the line:
     ``y -> s y``. The commissural diameter and the heights along the normal do not change.
     """
 
@@ -44,12 +44,12 @@ class Annuloplasty:
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """An edge-to-edge clip: pairs of points of the two leaflets that are tied together.
+    """An edge-to-edge clip, which ties pairs of points of the two leaflets together.
 
-    The midsurfaces are held at the distance at which the contact carries its reference pressure.
+    The midsurfaces are held at the distance at which contact carries its reference pressure.
     """
 
-    #: position of its middle along the commissures (0: A2 to P2), in the reference frame
+    #: position of its centre along the commissures (0: A2 to P2), in the reference frame
     position_mm: Place = 0.0
     width_mm: Length = 5.0  #: along the free edges
     grasp_mm: Length = 4.0  #: distance from the free edges to which the leaflets are held
@@ -63,10 +63,10 @@ class Clip:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Changes of a valve; without any it is the valve as observed."""
+    """Changes of a valve; without changes it is the observed valve."""
 
     title: str  #: its name in a table
-    #: peak transmitral pressure; None: that of the observed valve
+    #: peak transmitral pressure; None: as observed
     pressure_mmHg: Pressure | None = None
     annuloplasty: Annuloplasty | None = None
     clip: Clip | None = None
@@ -79,7 +79,7 @@ class Scenario:
 
 
 def model_under(model: ClosureModel, scenario: Scenario) -> ClosureModel:
-    """A fresh model of the same valve under a scenario, and so are its guides.
+    """A fresh model of the same valve under a scenario; its guides change too.
 
     Raises
     ------
@@ -120,9 +120,9 @@ def narrowed(annulus: FloatArray, plane: AnnulusPlane, share: float) -> FloatArr
 
 
 def _share(valve: Valve, plane: AnnulusPlane, ring: Annuloplasty) -> float:
-    """Factor `narrowed` that gives the annulus the wanted diameter in its new plane.
+    """Factor for `narrowed` that gives the annulus the required diameter in its new plane.
 
-    It is nearly the ratio of the diameters; the centre of the curve moves a little.
+    The factor is nearly the ratio of the diameters, but the centre of the curve moves a little.
     """
     annulus = valve.motion.annulus[-1]
     before = measure_annulus(annulus, plane).anteroposterior_diameter
@@ -144,20 +144,20 @@ def _with_ring(valve: Valve, plane: AnnulusPlane, share: float) -> Valve:
 
 
 SPACING_MM = 2.5
-"""Largest distance of tied pairs along the free edge."""
+"""Largest spacing of tied pairs along the free edge."""
 
 
 def clip_points(valve: Valve, clip: Clip) -> tuple[FloatArray, FloatArray]:
     """Tied points of the first and the second leaflet, ``(k, 3)`` mm in the reference frame.
 
-    Two rows on each leaflet, at half and at the whole grasp from its free edge, in planes across
-    the commissural direction.
+    Two rows on each leaflet, at half and at full grasp from its free edge, in planes perpendicular
+    to the commissural direction.
 
     Raises
     ------
     GeometryError
-        If the clip lies where the free edges do not face each other, or grasps more leaflet than
-        there is.
+        If the free edges do not face each other at the clip, or it grasps more leaflet than there
+        is.
     """
     surface = valve.surface
     plane = plane_of(valve, surface.vertices[valve.annulus])
@@ -174,7 +174,7 @@ def clip_points(valve: Valve, clip: Clip) -> tuple[FloatArray, FloatArray]:
 
 
 def _edge_points(valve: Valve, plane: AnnulusPlane, origin: FloatArray) -> list[FloatArray]:
-    """Where the free edge crosses a plane across the commissures: first the anterior leaflet."""
+    """Where the free edge crosses a plane across the commissures, anterior leaflet first."""
     edge = valve.surface.vertices[valve.free_edge]
     x = (edge - origin) @ plane.lateral
     after = np.roll(x, -1)

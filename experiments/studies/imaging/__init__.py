@@ -1,1 +1,1 @@
-"""Detectors for valves in volumes: training and tests."""
+"""Training and testing of detectors for valves in volumes."""

@@ -1,4 +1,4 @@
-"""Valves, training samples, detectors and trials of the study of detectors.
+"""Valves, training samples, detectors and trials of the detector study.
 
 All are cached on disk under a key of their inputs and code, so an interrupted study continues.
 """
@@ -54,21 +54,21 @@ class DrawnValves:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOutSettings:
-    """Numbers of simulated test volumes, of valves that were not trained on."""
+    """Numbers of simulated test volumes, with valves not used in training."""
 
     volumes: Some  # of one frame, within the ranges of training
     shifted: Some  # of one frame, outside the ranges of training
     sequences: Some  # of all frames, within the ranges of training
     shifted_sequences: Count
-    wide_calibration: Count  # of valves for calibration, each setting within or outside the ranges
+    wide_calibration: Count  # of calibration valves, each setting in or outside the ranges
     without_valve: Some  # of each kind of volume without a valve
-    # mm: a detection whose points are on average this far off is not the valve.
+    # mm: a detection with this mean point error is not the valve.
     wrong_mm: Length = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImagingSettings:
-    """Detectors for valves in volumes: their training and their test."""
+    """Training and testing of detectors for valves in volumes."""
 
     bases: dict[str, TemplateParameters] = field(default_factory=dict)
     motion: MotionSettings = field(default_factory=MotionSettings)
@@ -80,21 +80,21 @@ class ImagingSettings:
     evaluate: bool = True
     held_out: HeldOutSettings
     processes: Annotated[Processes, NOT_HASHED] = 1
-    model: str | None = None  # file or "package" of detectors to be tested; null trains them
+    model: str | None = None  # file or "package" of detectors to test; null trains them
 
 
 SAMPLED_BY = (volume_samples, train_stage, fit_shape_model)
 
 
 def _grow(name: str, files: Sequence[Path], settings: TrainingSettings, seed: int) -> Boosters:
-    """Trees of one stage at a time, since samples of all stages would fill the memory."""
+    """Grow one stage at a time, because samples of all stages would fill the memory."""
     samples = (read_npz(file, [f"{name}.x", f"{name}.y"]).values() for file in files)
     x, y = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     return train_stage(name, x, y, settings, seed)
 
 
 class ImagingStore:
-    """The cached parts of a study of detectors with a resolved configuration."""
+    """The cached parts of a detector study with a resolved configuration."""
 
     def __init__(self, config: Values, settings: ImagingSettings) -> None:
         self._folder = Path(config["paths"]["outputs"]) / "detectors"
@@ -128,7 +128,7 @@ class ImagingStore:
         return entry_of(self._folder / "models", described, (*SAMPLED_BY, save_model), load_model)
 
     def samples_entry(self, number: int) -> Entry[Path]:
-        """The cache entry of the samples of a training volume, for any number of volumes."""
+        """The cache entry of one training volume's samples, for any number of volumes."""
         described = {**self._sampling(), "number": number}
         return entry_of(self._folder / "samples", described, SAMPLED_BY, lambda path: path)
 
@@ -181,7 +181,7 @@ class ImagingStore:
         return dict(zip(stages, self._made("stages", _grow, calls, len(stages)), strict=True))
 
     def tried(self, function: Any, trials: Sequence[Trial], file: Path) -> list[Seen]:
-        """Rows and arrays of trials by `try_volume` or `try_sequence`, for detectors in a file."""
+        """Rows and arrays of trials (`try_volume` or `try_sequence`), for detectors in a file."""
         # The measured accuracy of the detectors does not affect detection.
         boosters = load_model(file).boosters
         trees = "".join(text for name in STAGES for text in boosters[name].texts)
@@ -211,7 +211,7 @@ class ImagingStore:
 
 
 def _followed(title: str, total: int, part: str, made: Iterable[Any]) -> Iterator[Any]:
-    """The same values, with a progress bar."""
+    """Yield the same values with a progress bar."""
     with PartBar(title, total, part) as bar:
         for one in made:
             yield one

@@ -1,4 +1,4 @@
-"""Training of the detectors of valves in echo volumes, and their errors."""
+"""Trains the detectors of valves in echo volumes and measures their errors."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ if TYPE_CHECKING:
 Row = Mapping[str, Any]
 
 MODEL, PACKAGED = "tee.npz", "package"
-"""File of the trained detectors in the folder of a run, and name of those of the package."""
+"""File of trained detectors in a run's folder, and name of the packaged detectors."""
 
 POPULATIONS = ("train", "calibration", "test")
 
 CALIBRATION, *TESTED, WIDE = SEQUENCES
-"""Kinds of volumes over time: for measuring errors, for tests, and for the growth of errors with
-falling confidence."""
+"""Kinds of volumes over time: to measure errors, for tests, and to measure how errors grow as
+confidence falls."""
 
 LIMIT_MM = 1.5
 """A detected valve with a larger mean surface distance counts as wrong."""
@@ -76,12 +76,12 @@ COLUMNS: Mapping[str, Column] = {
     "percentile_90": Column(label="90th percentile"),
     **dict.fromkeys(("rms", "stated", "rms_handed_on", "stated_handed_on"), Column("mm", ".2f")),
 }
-"""Columns with a unit, of all tables."""
+"""Columns with a unit, in all tables."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     imaging: ImagingSettings
 
@@ -152,21 +152,21 @@ def _held_out(store: ImagingStore, file: Path) -> list[Seen]:
 def calibrated(
     seen: Sequence[Seen], min_confidence: float, wrong_mm: float
 ) -> tuple[DetectionAccuracy, list[str]]:
-    """Errors in the calibration volumes whose valve was detected, and the names of these valves.
+    """Errors in the calibration volumes with a detected valve, and the names of these valves.
 
     Parameters
     ----------
     seen : sequence
-        Rows and arrays of `try_sequence`, of all kinds.
+        Rows and arrays from `try_sequence`, of all kinds.
     min_confidence : float
-        Of a detected valve.
+        Lowest confidence of a detected valve.
     wrong_mm : float
-        A detection whose points are on average this far off is not the valve.
+        A detection with this mean point error is not the valve.
 
     Raises
     ------
     InputError
-        If the valve was detected in fewer than two of them.
+        If fewer than two volumes have a detected valve.
     """
     own = _detected(seen, CALIBRATION, min_confidence, wrong_mm)
     if len(own) < 2:
@@ -260,10 +260,10 @@ def tables_of(trials: DataFrame, covered: Sequence[Row]) -> dict[str, Table]:
 def judge(
     rows: Sequence[Row], min_confidence: float, wrong_mm: float, like_from: float
 ) -> DataFrame:
-    """Rows of trials, and whether each is called a valve, is right, and is unlike the training.
+    """Rows of trials; whether each is detected as a valve, correct, and unlike the training data.
 
-    A valve is right if its points are nearer than ``wrong_mm``. Volumes are unlike if their
-    confidence, or that of the median frame over time, is below ``like_from``.
+    A valve is correct if its mean point error is below ``wrong_mm``. A volume is unlike the
+    training data if its confidence (of the median frame over time) is below ``like_from``.
     """
     import pandas as pd
 
@@ -280,9 +280,9 @@ def judge(
 
 
 def kind_rows(trials: DataFrame) -> DataFrame:
-    """A row for each kind of volumes: confidence of the detectors and shares of right detections.
+    """A row for each kind of volume: detector confidence and fractions of correct detections.
 
-    A valve is lost if it is not found or something else is.
+    A valve is lost if nothing or something else is detected.
     """
     found, wrong = trials["called"], trials["surface"] >= LIMIT_MM
     judged = trials.assign(
@@ -300,7 +300,7 @@ def kind_rows(trials: DataFrame) -> DataFrame:
 
 
 def error_rows(trials: DataFrame) -> DataFrame:
-    """Mean, median and 90th percentile of the sizes of errors of detected valves, by kind."""
+    """Mean, median and 90th percentile of absolute errors of detected valves, by kind."""
     found = trials[trials["called"] & trials["kind"].isin([*VOLUMES, *TESTED])]
     errors = found.melt("kind", list(ERRORS), "error", "size").dropna(subset="size")
     sizes = errors.assign(size=errors["size"].abs()).groupby(["error", "kind"], sort=False)["size"]

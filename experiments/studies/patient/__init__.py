@@ -1,1 +1,1 @@
-"""Virtual patients: the study, and its figures."""
+"""The study of virtual patients, and its figures."""

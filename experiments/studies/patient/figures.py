@@ -1,4 +1,4 @@
-"""Figure 3 of the virtual patients, and ranks of truths in the posteriors of scenarios."""
+"""Figure 3 of the virtual patients, and ranks of the truth in each scenario's posteriors."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ LEAFLETS = ("#2b6ca3", "#c8452f")
 
 
 def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Figure:
-    """The closed valves from the atrium, generic above personalised, on one scale.
+    """The closed valves seen from the atrium, generic above personalised, on one scale.
 
     Parameters
     ----------
     fields : mapping
         Name of each patient -> its arrays.
     denied : sequence of str
-        Names of patients with the verdict "no estimate", which is written above them.
+        Names of patients with the verdict "no estimate", which the figure shows above them.
 
     Raises
     ------
     InputError
-        If a patient has no distances.
+        If a patient's distances are missing.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -83,7 +83,7 @@ def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Fi
 
 
 def _closed(valve: CaseFields, which: str) -> tuple[FloatArray, FloatArray]:
-    """Closed positions and distances of a model."""
+    """A model's closed positions and distances."""
     positions, distance = getattr(valve, which), getattr(valve, f"distance_{which}")
     if positions is None or distance is None:
         raise InputError("Figure 3 needs the distances of the generic and personalised valves")
@@ -91,11 +91,11 @@ def _closed(valve: CaseFields, which: str) -> tuple[FloatArray, FloatArray]:
 
 
 def ranks_figure(scenarios: Groups) -> Figure:
-    """Ranks of the truth in the posterior, in a panel for each scenario.
+    """Ranks of the truth in the posterior, one panel per scenario.
 
-    Drawn is the difference of their empirical distribution function from the uniform one, with the
-    band that contains 95 % of samples everywhere (Kolmogorov 1933, Giorn. Ist. Ital. Attuari 4:83).
-    Above zero on the left: truths are too low in the posterior.
+    Each panel shows the empirical minus the uniform distribution function of the ranks, with the
+    simultaneous 95 % band (Kolmogorov 1933, Giorn. Ist. Ital. Attuari 4:83). Values above zero on
+    the left mean that truths are too low in the posterior.
     """
     from mvest.reporting.figures import panels
 

@@ -1,9 +1,9 @@
-"""Virtual patients: simulated, estimated blindly by another process, and compared with the truth.
+"""Simulates virtual patients, estimates them blind in another process, compares with the truth.
 
 The study has three published tables. ``patients`` has the paper's Tables 2 and 3 and Figure 3 for
 five virtual patients. ``population`` counts how often intervals contain the truth for thirty random
-patients. ``calibration`` counts the same in misspecification scenarios, each of which violates one
-assumption of the estimator, and so measures the value of a verdict.
+patients. ``calibration`` does the same for misspecification scenarios; each violates one assumption
+of the estimator, so the counts show what a verdict is worth.
 """
 
 from __future__ import annotations
@@ -57,17 +57,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POPULATION, CALIBRATION = "population", "calibration"
-"""Published tables other than that of the five patients."""
+"""Published tables other than the five patients' table."""
 ORDER = ("normal_small", "normal_large", "functional_mr", "prolapse", "fibroelastic")
 """Order of the five patients; others follow by name."""
 REFERENCE = "reference"
 """The scenario without misspecification."""
 WITH = "with nuisances"
-"""The estimate of all unknowns, which has the verdict."""
+"""The estimate of all unknowns, to which the verdict applies."""
 ALTERNATIVES = {"moduli_only": "without nuisances", "paper": "paper's filter"}
 """Name in a record -> label in tables."""
 WHICH = ("generic", "registered", "personalised")
-"""Closed valves whose distances are listed; the registered one is the rigidly moved generic one."""
+"""Closed valves with listed distances; the registered valve is the generic one moved rigidly."""
 
 MM = Column("mm", ".2f")
 TAILS = (0.025, 0.975)
@@ -76,14 +76,14 @@ KEPT_ARRAYS = (
     "triangles", "region", "rest", "annulus", "free_edge", "frames", "seen", "tips", "chord_tip",
     "chord_insertion", "generic", "fitted", "distance_generic", "distance_fitted", "reach_mm",
 )  # fmt: skip
-"""Arrays that Figure 3 needs."""
+"""Arrays needed for Figure 3."""
 
 Patients = Sequence[tuple[Record, EstimateRecord]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration."""
+    """Settings that the study adds to the configuration."""
 
     patient: PatientSettings
     personal: PersonalSettings
@@ -91,17 +91,17 @@ class Settings:
 
 # -- run ------------------------------------------------------------------------------------------
 def run_patient(job: Job[Settings]) -> Result:
-    """Simulate a patient, estimate in another process, then reveal the truth."""
+    """Simulate a patient, estimate in a separate process, then reveal the truth."""
     patient = job.settings.patient
     place = make_patient(job.values, patient)
-    # A drawn patient has another anatomy than the configured one.
+    # A random patient's anatomy differs from the configured one.
     gate = NOT_GATED if patient.variation else gate_of(job.values)
     estimated = estimate_blindly(job.values, job.folder, place.case, place.hidden, gate)
     return reveal(estimated, place, patient, job.values["seed"])
 
 
 def reveal(estimated: Result, place: PatientPlace, patient: PatientSettings, seed: int) -> Result:
-    """The result of an estimation with the truth; an InputError if that is missing."""
+    """Add the truth to an estimation's result; InputError if the truth is missing."""
     hidden, positions = place.truth()
     (blind,) = estimated.estimates
     arrays, frames = dict(estimated.arrays), blind.frames
@@ -135,9 +135,9 @@ def reveal(estimated: Result, place: PatientPlace, patient: PatientSettings, see
 def _true_quantities(
     estimate: EstimateRecord, case: ValveCase, positions: Mapping[str, FloatArray]
 ) -> dict[str, Number]:
-    """True ratio and strains (``true NAME``), and their values without an estimate (``else NAME``).
+    """True ratio and strains (``true NAME``), and defaults without an estimate (``else NAME``).
 
-    These are the generic ratio, and the strains between the observed frames.
+    The defaults are the generic ratio and the strains between the observed frames.
     """
     known = {str(own["name"]): own for own in estimate.details.get("known", ())}
     truths = [own.truth for own in estimate.moduli if own.truth]
@@ -164,7 +164,7 @@ def _nees(estimate: EstimateRecord) -> float | None:
 
 
 def check_patient(values: Values, folder: Path) -> str:
-    """Check a virtual patient's case, which is simulated first if necessary."""
+    """Check a virtual patient's case; simulate it first if necessary."""
     patient = values["patient"] and build(PatientSettings, values["patient"])
     return check(values, read_case(make_patient(values, patient).case), folder)
 
@@ -223,12 +223,12 @@ def _by_scenario(patients: Patients) -> Groups:
 
 
 def _by_way(estimates: Sequence[EstimateRecord]) -> Groups:
-    """Estimates by their unknowns and filter, with the verdict on the patient."""
+    """Estimates by unknowns and filter, with the patient's verdict."""
     return grouped((name, way, one) for one in estimates for name, way in _ways(one).items())
 
 
 def _ways(estimate: EstimateRecord) -> dict[str, EstimateRecord]:
-    """An estimate and its alternatives by their labels in tables."""
+    """An estimate and its alternatives, by their labels in tables."""
     others = estimate.alternatives
     return {WITH: estimate} | {
         label: others[name] for name, label in ALTERNATIVES.items() if name in others
@@ -236,7 +236,7 @@ def _ways(estimate: EstimateRecord) -> dict[str, EstimateRecord]:
 
 
 def _table2(estimates: Sequence[EstimateRecord]) -> Table:
-    """A row for each patient and modulus, with all estimates; the truth is the paper's estimate."""
+    """A row per patient and modulus, with all estimates; the truth is the paper's estimate."""
     rows = []
     for estimate in estimates:
         ways = _ways(estimate)
@@ -258,7 +258,7 @@ def _table2(estimates: Sequence[EstimateRecord]) -> Table:
 
 
 def _table3(patients: Patients) -> Table:
-    """A row for each patient and frame: distances of the closed valves, mm."""
+    """A row per patient and frame: distances (mm) of the closed valves."""
     rows = []
     for record, estimate in patients:
         for fit in estimate.frames:
@@ -308,7 +308,7 @@ def _distances(frames: Table) -> Table:
 
 
 def _quantities(patients: Patients) -> dict[str, list[Unknown]]:
-    """Ratio and strains of all stated estimates, with `_true_quantities` as truth and guess."""
+    """Ratio and strains of all reported estimates, with `_true_quantities` as truth and guess."""
     groups: dict[str, list[Unknown]] = {}
     for record, estimate in patients:
         for own in estimate.details.get("known", ()) if estimate.is_stated else ():
@@ -321,7 +321,7 @@ def _quantities(patients: Patients) -> dict[str, list[Unknown]]:
 
 
 def _estimates(patients: Patients) -> Table:
-    """A row for each patient, estimation and unknown, for programs."""
+    """A machine-readable row per patient, estimation and unknown."""
     rows = []
     for record, estimate in patients:
         failed_checks = () if estimate.verdict is None else estimate.verdict.failed_checks
@@ -344,7 +344,7 @@ def _estimates(patients: Patients) -> Table:
 
 
 def _with_nees(skill: Table, patients: Patients) -> Table:
-    """The skill of scenarios and their mean `_nees` with the 95 % bounds for right posteriors."""
+    """Skill per scenario, and mean `_nees` with its 95 % bounds for correct posteriors."""
     import pandas as pd
 
     numbers = pd.DataFrame([{"scenario": _scenario(one), **one.numbers} for one, _ in patients])
@@ -378,13 +378,13 @@ def figure(results: Results) -> dict[str, Figure]:
 
 # -- published records ----------------------------------------------------------------------------
 def keep(record: Record) -> Record:
-    """The parts of a record that tables and figures need; the folder of the run has all of it."""
+    """The parts of a record that tables and figures need; the run's folder has the full record."""
     details = ("known",) if record.table == POPULATION else ()
     return short(record, nuisances=record.table != CALIBRATION, details=details)
 
 
 def keep_arrays(record: Record, path: Path) -> dict[str, Any]:
-    """Arrays that Figure 3 needs, in single precision."""
+    """Arrays needed for Figure 3, in single precision."""
     if record.table in (POPULATION, CALIBRATION):
         return {}
     stored = read_npz(path)

@@ -1,1 +1,1 @@
-"""Input decks of Abaqus, and closures that were computed from them."""
+"""Abaqus input decks, and closures computed from them."""

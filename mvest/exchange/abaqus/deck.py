@@ -1,13 +1,13 @@
 """Abaqus input decks (``.inp``) in the form of Texas TriValve: one instance, one step.
 
-Read are nodes, shells (``S4R``, ``S3``) and trusses (``T3D2``), their sets and sections, Ogden
-materials, amplitudes, and the step with its duration, constrained nodes and pressure. A deck that
-generates nodes or elements, has a moved instance, or includes other files is refused. Other
-keywords are ignored.
+The reader takes nodes, shells (``S4R``, ``S3``) and trusses (``T3D2``), their sets and sections,
+Ogden materials, amplitudes, and the step with its duration, constrained nodes and pressure. It
+refuses a deck that generates nodes or elements, has a moved instance, or includes other files. It
+ignores other keywords.
 
 Format: *Abaqus Keywords Reference Guide*, and *Analysis User's Guide*, "Input syntax rules". A
 keyword line begins with one star, a comment with two; options are ``NAME=VALUE``; case does not
-matter. The instance in front of a name is ignored.
+matter. The instance prefix of a name is ignored.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mvest.reading.text import MAX_NUMBER, one_line, read_bytes
 from mvest.typing import FloatArray, IntArray
 
 CORNERS = {"S4R": 4, "S3": 3, "T3D2": 2}
-"""Nodes of the elements that are read."""
+"""Number of nodes of each supported element."""
 _REFUSED = {
     *("INCLUDE", "NGEN", "NCOPY", "NFILL", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "TRANSFORM"),
     *("SUBMODEL", "IMPORT", "RESTART", "MAP SOLUTION", "DLOAD", "STATIC"),
@@ -34,7 +34,7 @@ _REFUSED = {
 
 @dataclass(slots=True)
 class _Block:
-    """A keyword (in capitals) at a line, its options, and the words of its data lines."""
+    """A keyword (in capitals), its line number, its options, and the words of its data lines."""
 
     keyword: str
     options: dict[str, str]
@@ -42,7 +42,7 @@ class _Block:
     rows: list[list[str]] = field(default_factory=list)
 
     def option(self, name: str, default: str | None = None) -> str:
-        """An option in capitals, without an instance."""
+        """An option in capitals, without its instance prefix."""
         value = self.options.get(name) or default
         if value is None:
             raise InputError(f"no {name}=")
@@ -55,7 +55,7 @@ class _Block:
 
 
 class Deck:
-    """The content of a deck; nodes and elements are numbered from 0 in its order.
+    """The content of a deck, with nodes and elements numbered from 0 in file order.
 
     Raises
     ------
@@ -65,11 +65,11 @@ class Deck:
 
     def __init__(self, path: Path) -> None:
         self.nodes: list[list[float]] = []  # (n, 3)
-        self.cells: list[list[int]] = []  # nodes: 4 of a shell (S3 repeats the last), 2 of a truss
+        self.cells: list[list[int]] = []  # nodes: 4 per shell (S3 repeats the last), 2 per truss
         # NSET or ELSET -> name in capitals -> increasing numbers
         self.sets: dict[str, dict[str, IntArray]] = {"NSET": {}, "ELSET": {}}
-        # Elements, material, and thickness (mm) or cross section (mm^2), 0 if not given. Later
-        # sections of an element override earlier ones.
+        # Elements, material, and thickness (mm) or cross section (mm^2), 0 if not given. A later
+        # section of an element overrides an earlier one.
         self.sections: list[tuple[IntArray, str, float]] = []
         self.ogden: dict[str, FloatArray] = {}  # material -> (t, 2) mu (MPa) and alpha
         # Elements, pressure (MPa) against their normals, and its amplitude
@@ -93,7 +93,7 @@ class Deck:
 
     @property
     def section(self) -> IntArray:
-        """Number ``(m,)`` of the section of each element; -1 without one."""
+        """Section number ``(m,)`` of each element; -1 without one."""
         result = np.full(len(self.cells), -1)
         for k, (members, _, _) in enumerate(self.sections):
             result[members] = k
@@ -106,12 +106,12 @@ class Deck:
 
     @property
     def held(self) -> IntArray:
-        """Nodes with three prescribed coordinates."""
+        """Nodes whose three coordinates are all prescribed."""
         held = [node for node, axes in self._axes.items() if {1, 2, 3} <= axes]
         return np.array(sorted(held), dtype=np.int64)
 
     def members(self, kind: str, name: str) -> IntArray:
-        """Numbers of a set (NSET or ELSET).
+        """Members of a set (NSET or ELSET), as numbers.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class Deck:
         return members
 
     def share(self, amplitude: str, times: FloatArray) -> FloatArray:
-        """Share of the pressure at times ``(k,)`` s, constant before and after.
+        """Fraction of the pressure at times ``(k,)`` s, constant outside the amplitude's points.
 
         Between two points it is Abaqus' smooth step ``10 u^3 - 15 u^4 + 6 u^5``.
 
@@ -217,7 +217,7 @@ class Deck:
                         self.pressures.append((members, side * value, amplitude))
 
     def _labelled(self, kind: str, block: _Block, width: int, first: int) -> FloatArray:
-        """Values ``(n, width - 1)`` of new nodes or elements, whose labels and set are stored."""
+        """Store labels and set of new nodes or elements; return their values ``(n, width - 1)``."""
         for row in block.rows:
             if len(row) != width:
                 raise InputError(f"{len(row)} numbers in a line, expected {width}")
@@ -233,7 +233,7 @@ class Deck:
         self.sets[kind][name] = np.union1d(self.sets[kind].get(name, members), members)
 
     def _numbers_of(self, kind: str, words: Iterable[str]) -> IntArray:
-        """Increasing numbers of labels and sets."""
+        """Increasing numbers of the members that labels and set names refer to."""
         found = set[int]()
         for word in map(_plain, words):
             if word.isdecimal():
@@ -260,7 +260,7 @@ def _blocks(text: str) -> list[_Block]:
 
 
 def _plain(name: str) -> str:
-    """A name in capitals, with single spaces and without an instance."""
+    """A name in capitals, with single spaces and without its instance prefix."""
     return " ".join(name.split()).upper().rpartition(".")[2]
 
 

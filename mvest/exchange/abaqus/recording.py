@@ -1,12 +1,12 @@
 """A valve closure computed with Abaqus: an input deck and its frames.
 
 A folder ``NAME`` holds ``NAME.inp`` and ``NAME_0.vtu``, ``NAME_1.vtu``, ..., the positions of all
-nodes at equal intervals of the step. Lengths are mm, stresses MPa, times s. Leaflets are shells,
-chordae trusses; the caller names the sets of leaflets, annulus and free edge. The deck states
-thickness, chord materials and sections, the held chord nodes (papillary muscles), and the pressure.
-The frames state the motion of annulus and papillary muscles.
+nodes at equal time intervals. Lengths are mm, stresses MPa, times s. Leaflets are shells, chordae
+trusses; the caller names the sets of leaflets, annulus and free edge. The deck gives thickness,
+chord materials and sections, the fixed chord nodes (papillary muscles), and the pressure. The
+frames give the motion of annulus and papillary muscles.
 
-Such a case is the Texas TriValve 1.1 (SoftTissueBiomechanicsLab/Texas_TriValve_1.1, CC BY 4.0;
+One such case is Texas TriValve 1.1 (SoftTissueBiomechanicsLab/Texas_TriValve_1.1, CC BY 4.0;
 Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w), a human donor
 **tricuspid** valve (three leaflets, right heart). It is not part of this package.
 """
@@ -34,18 +34,18 @@ from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coo
 from mvest.valve.mesh.remesh import remesh
 
 TOE_STRAIN = 0.01
-"""Strain of the secant stiffness of chordae.
+"""Strain at which the secant stiffness of chordae is taken.
 
-Chordae act as strings that hardly lengthen. The far higher stiffness of exponential ones at several
-percent would describe a state that no recorded closure reaches.
+Chordae act as strings that hardly lengthen. Exponential chordae are far stiffer at several percent
+strain, which no recorded closure reaches.
 """
 TOLERANCE_MM = 1e-3
-"""Frames have single precision: 2e-6 mm at 30 mm."""
+"""Frames are stored in single precision: 2e-6 mm at 30 mm."""
 SAME_MM = 1e-6
-"""Largest distance of coincident anchors."""
+"""Largest distance between coincident anchors."""
 MAX_FRAMES = 500
 EXTENT_MM = (5.0, 500.0)
-"""Of the leaflets, to detect lengths in cm or m."""
+"""Bounds of the leaflets' size, to detect lengths in cm or m."""
 PRESSURE_MPA = (1e-4, 0.1)
 """1 to 750 mmHg."""
 
@@ -54,10 +54,10 @@ PRESSURE_MPA = (1e-4, 0.1)
 class Recording:
     """A valve at rest and its recorded closure.
 
-    ``valve`` is the fine midsurface in frame 0, with normals to the ventricle, fibres parallel to
-    the annulus, and the motion of the frames. ``frames (f, n, 3)`` mm are the recorded positions of
-    its vertices at ``times (f,)`` s, from 0 to the end of the step. ``pressure`` is in MPa on the
-    ventricular face at the end, ``pressure_share (f,)`` its share in each frame.
+    ``valve`` is the fine midsurface in frame 0, with normals towards the ventricle, fibres parallel
+    to the annulus, and the recorded motion. ``frames (f, n, 3)`` mm are the recorded positions of
+    its vertices at ``times (f,)`` s, from 0 to the end of the step. ``pressure`` (MPa) acts on the
+    ventricular face at the end, ``pressure_share (f,)`` is its fraction in each frame.
     """
 
     valve: Valve
@@ -67,7 +67,7 @@ class Recording:
     pressure_share: FloatArray
 
     def remeshed(self, count: int) -> tuple[IntArray, Valve]:
-        """Vertices ``(count,)`` of the midsurface, and the valve with these vertices alone."""
+        """Vertices ``(count,)`` of the midsurface, and the valve remeshed on these alone."""
         fine = self.valve
         coarse = remesh(fine.surface, fine.annulus, fine.free_edge, count)
         on_annulus = np.isin(fine.annulus, coarse.kept)
@@ -77,12 +77,12 @@ class Recording:
 
 
 def recording_files(folder: Path) -> list[Path]:
-    """The deck of a folder and its frames in their order.
+    """The deck of a folder, followed by its frames in order.
 
     Raises
     ------
     InputError
-        There is no deck, or frames are missing.
+        The deck or a frame is missing.
     """
     deck = folder / f"{folder.name}.inp"
     if not deck.is_file():
@@ -100,14 +100,14 @@ def recording_files(folder: Path) -> list[Path]:
 def read_recording(
     folder: Path, leaflets: Mapping[str, str], annulus: str, free_edge: str
 ) -> Recording:
-    """Read a recorded closure: ``leaflets`` maps regions to element sets, the others are node sets.
+    """Read a recorded closure. ``leaflets`` maps regions to element sets; the others are node sets.
 
-    Names may have their instance or not, in any case.
+    Names are case-insensitive and may include their instance.
 
     Raises
     ------
     InputError
-        Files are absent or damaged, the deck has unsupported content, or contradicts the frames.
+        Files are missing or damaged, or the deck has unsupported content or contradicts the frames.
     """
     path, *files = recording_files(folder)
     with refusing(path, "input deck"):
@@ -126,7 +126,7 @@ def read_recording(
         frame[:] = found
     if not np.abs(points[0] - nodes).max() <= TOLERANCE_MM:
         raise InputError(f"{files[0]}: points are not the nodes of the deck")
-    # The motion begins at the nodes of the deck, which have double precision.
+    # The motion starts from the nodes of the deck, which have double precision.
     ring, held = (nodes[k] + (points[:, k] - points[0, k]) for k in (vertices[rims[0]], anchors))
     with named(folder):
         tips, tip = _group_anchors(held)
@@ -145,7 +145,7 @@ def read_recording(
 
 
 def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArray, Chordae]:
-    """The anchors, and the chordae with numbers of anchors as numbers of tips."""
+    """The anchors, and the chordae, which use anchor numbers as tip numbers."""
     trusses = deck.trusses
     edges, section = np.array([deck.cells[k] for k in trusses]), deck.section[trusses]
     if not trusses.size or section.min() < 0:
@@ -154,7 +154,7 @@ def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArra
     if not anchors.size:
         raise InputError("no chord node is constrained, so the papillary muscles are unknown")
     anchor, insertion, length, share = trace_cables(nodes, edges, anchors, leaflets)
-    # The family of a cable is the section of the first truss at its insertion.
+    # A cable's family is the section of the first truss at its insertion.
     ends, first = np.unique(edges, return_index=True)
     used, of_truss = np.unique(section, return_inverse=True)
     family = of_truss[first // 2][np.searchsorted(ends, insertion)]
@@ -178,19 +178,19 @@ def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArra
 def trace_cables(
     nodes: FloatArray, edges: IntArray, anchors: IntArray, leaflet: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """The chord network of a detailed model as straight tension-only cables.
+    """Replace the chord network of a detailed model by straight tension-only cables.
 
-    Detailed models hold chordae as a graph: a trunk leaves a papillary anchor, splits, and fans out
-    into many insertions. Each pair of anchor and insertion becomes a cable with
+    Detailed models store chordae as a graph: a trunk leaves a papillary anchor, splits, and fans
+    out into many insertions. Each pair of anchor and insertion becomes a cable with
 
     * the rest length of the shortest path along the network, so that it tightens exactly when the
       path is straight;
-    * a share of the axial stiffness of the trunk. If all insertions of an anchor pull equally, the
+    * a share of the trunk's axial stiffness. If all insertions of an anchor pull equally, the
       force in edge ``e`` is ``n_e`` times that at an insertion, where ``n_e`` counts the paths
-      through ``e``. Insertion ``j`` then yields by ``sum_e n_e l_e / EA`` per unit force, as does a
+      through ``e``. Insertion ``j`` then moves by ``sum_e n_e l_e / EA`` per unit force. So does a
       cable of rest length ``L_j`` and stiffness ``EA L_j / sum_e n_e l_e``.
 
-    The cables do not restrain each other sideways, as branches of one trunk do.
+    Unlike branches of one trunk, the cables do not restrain each other sideways.
 
     Parameters
     ----------
@@ -203,8 +203,8 @@ def trace_cables(
     Returns
     -------
     anchor, insertion, length, share : (c,)
-        Nodes at the ends of each cable; mm along the network; axial stiffness of the cable over
-        that of the chord material, in (0, 1].
+        End nodes of each cable; length along the network (mm); axial stiffness of the cable
+        relative to that of the chord material, in (0, 1].
 
     Raises
     ------
@@ -215,7 +215,7 @@ def trace_cables(
     if np.any(length <= 0):
         raise InputError(f"chord segment {int(np.argmin(length))} has no length")
     on_leaflet = np.isin(np.arange(len(nodes)), leaflet)
-    # No edges out of leaflet nodes: two chords that insert at one node do not continue.
+    # No edges leave leaflet nodes: a path must not continue into another chord at its insertion.
     both = np.vstack([edges, edges[:, ::-1]])
     outward = ~on_leaflet[both[:, 0]]
     graph = csr_matrix(
@@ -238,7 +238,7 @@ def trace_cables(
     shares = []
     for far, back, there in zip(distance, predecessor, reachable, strict=True):
         own = ends[there].tolist()
-        paths = []  # without the anchor; a node stands for the segment that leads to it
+        paths = []  # without the anchor; a node represents the segment that leads to it
         for end in own:
             path = [end]
             while back[path[-1]] >= 0:
@@ -254,12 +254,12 @@ def trace_cables(
 
 
 def truss_stiffness(area: float, ogden: FloatArray, strain: float = TOE_STRAIN) -> float:
-    """Secant stiffness (N) of an incompressible Ogden truss of some area (mm^2): force over strain.
+    """Secant stiffness (N), force over strain, of an incompressible Ogden truss of ``area`` (mm^2).
 
     The nominal stress is ``sum 2 mu/alpha (l^(alpha-1) - l^(-alpha/2-1))`` at stretch
     ``l = 1 + strain`` (Ogden 1972, Proc. R. Soc. A 326:565, in Abaqus' convention); ``ogden``
-    ``(t, 2)`` has mu (MPa) and alpha of each term. An InputError names an area or a stress that is
-    not positive.
+    ``(t, 2)`` has mu (MPa) and alpha of each term. Raises an InputError if the area or the stress
+    is not positive.
     """
     mu, alpha = ogden.T
     stretch = 1 + strain
@@ -275,7 +275,7 @@ def truss_stiffness(area: float, ogden: FloatArray, strain: float = TOE_STRAIN) 
 
 
 def _pressure(deck: Deck, leaflets: IntArray, times: FloatArray) -> tuple[float, FloatArray]:
-    """Pressure (MPa) against the shells' normals at the end, and its share at each time."""
+    """Final pressure (MPa) against the shells' normals, and its fraction at each time."""
     loaded = [load for load in deck.pressures if np.isin(load[0], leaflets).any()]
     covered = np.concatenate([np.zeros(0, np.int64), *(members for members, _, _ in loaded)])
     once = len(np.unique(covered)) == len(covered) and np.isin(leaflets, covered).all()
@@ -299,7 +299,7 @@ def _pressure(deck: Deck, leaflets: IntArray, times: FloatArray) -> tuple[float,
 def _leaflets(
     deck: Deck, groups: Sequence[IntArray], annulus: str, free_edge: str, *, turned: bool
 ) -> tuple[dict[str, Any], IntArray, list[IntArray]]:
-    """The leaflets as triangles with the normals of the shells or, if ``turned``, opposite ones.
+    """The leaflets as triangles with the shells' normals, reversed if ``turned``.
 
     Returns ``triangles``, ``region`` and ``thickness``; the increasing numbers of their nodes; and
     the vertices of annulus and free edge in loop order.
@@ -340,7 +340,7 @@ def _leaflets(
     sizes = np.array([*(size for _, _, size in deck.sections), 0.0])[deck.section[elements]]
     if not sizes.all():
         raise InputError("shells without a section that states a thickness")
-    # The thicker leaflet counts where two meet.
+    # Where two leaflets meet, the thicker one counts.
     thickness = np.zeros(len(vertices))
     np.maximum.at(thickness, corners.ravel(), np.repeat(sizes, 4))
     surface = {"triangles": triangles, "region": region[element], "thickness": thickness}
@@ -348,7 +348,7 @@ def _leaflets(
 
 
 def _split(vertices: FloatArray, quads: IntArray, on_rim: IntArray) -> tuple[IntArray, IntArray]:
-    """Two triangles per quad, cut along the shorter diagonal, and the element of each triangle.
+    """Split each quad along its shorter diagonal; also return the element of each triangle.
 
     A quad with two sides on one rim is cut from their common corner, so that no triangle has three
     corners on that rim.
@@ -367,7 +367,7 @@ def _split(vertices: FloatArray, quads: IntArray, on_rim: IntArray) -> tuple[Int
 
 
 def _group_anchors(path: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Positions ``(f, t, 3)`` of the distinct anchors ``(f, a, 3)``, and the number of each."""
+    """Merge coincident anchors ``(f, a, 3)`` to ``(f, t, 3)``; also return the number of each."""
     near = np.linalg.norm(path[0][:, None] - path[0][None], axis=2) < SAME_MM
     count, group = connected_components(coo_matrix(near), directed=False)
     tips = np.stack([path[:, group == g].mean(axis=1) for g in range(count)], axis=1)

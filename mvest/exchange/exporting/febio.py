@@ -1,4 +1,4 @@
-"""A case as input of FEBio (file format 4)."""
+"""Exports a case as FEBio input (file format 4)."""
 
 from __future__ import annotations
 
@@ -24,47 +24,47 @@ GENERIC = {
     "E_f": {"anterior": 6.23, "posterior": 2.09},
     "ratio": {"anterior": 6.23 / 2.35, "posterior": 2.09 / 1.89},
 }
-"""E_f (MPa) and E_f over E_perp of the method paper (ISBI 2013)."""
+"""E_f (MPa) and E_f / E_perp from the method paper (ISBI 2013)."""
 CONTACT_COLUMNS, CONTACT_ROWS = 144, 32
-"""Samples of the valve for patches of chordae and the annulus."""
+"""Samples of the valve for chordal patches and the annulus."""
 CONTACTS = ("potential", "none")
 SAMPLES, TOE_POINTS = 61, 41
-"""Points of the curves of pressure and motion over the ramp, and of a chord's force over its toe.
+"""Points of the pressure and motion curves over the ramp, and of a chord's force over its toe.
 """
 STEPS = 30
 """Initial number of time steps over the ramp; FEBio adapts it."""
 EXPONENT = 4.0
-"""p of the contact potential, FEBio's default."""
+"""Exponent p of the contact potential, FEBio's default."""
 
 
 @dataclass(frozen=True, slots=True)
 class FebioOptions:
-    """Values that the case does not state, and choices in FEBio.
+    """Values that the case does not state, and FEBio settings.
 
     Attributes
     ----------
     E_f, ratio : tuple of float, optional
-        MPa and E_f over E_perp of each leaflet, in the order of the case's regions; generic by
+        E_f (MPa) and E_f / E_perp of each leaflet, in the order of the case's regions; generic by
         default.
     pressure_mmHg : float, optional
-        By default that of the closed frame.
+        Defaults to that of the closed frame.
     columns, rows : int
         Bricks around the valve and along the leaflets.
     law : str
-        ``neo-hookean``, which is nearer to the linear law in compression and keeps elements from
+        ``neo-hookean``, which is closer to the linear law in compression and keeps elements from
         inverting, or ``orthotropic`` (:mod:`mvest.exchange.febio.document`).
     contact : str
         ``potential`` (FEBio's contact potential between the atrial faces) or ``none``.
     contact_gap_mm : float
-        Gap of the atrial faces of two flat leaflets under the reference pressure of the contact.
+        Gap between the atrial faces of two flat leaflets at the contact's reference pressure.
     contact_reach_mm : float
         Gap (mm) at which contact begins.
     dynamic : bool
-        With inertia and damping by mass, to the end of the protocol; otherwise static, to the end
-        of its ramp.
+        Run with inertia and mass-proportional damping to the end of the protocol; otherwise static,
+        to the end of its ramp.
     density_factor : float
-        Factor on the density of a dynamic run. Heavier leaflets allow larger time steps and come to
-        rest at the same state.
+        Factor on the density of a dynamic run. Heavier leaflets allow larger time steps and reach
+        the same rest state.
     """
 
     E_f: tuple[float, ...] | None = None
@@ -100,7 +100,7 @@ def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
     Raises
     ------
     InputError, GeometryError, MaterialError
-        The source is no case, or FEBio has no counterpart of the valve.
+        The source is not a case, or FEBio has no counterpart for the valve.
     """
     if target.suffix.lower() != ".feb":
         raise InputError(f"{target}: expected a name that ends in .feb")
@@ -112,7 +112,7 @@ def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
 
 
 def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
-    """The closure of a case without parameters."""
+    """The closure model of a case, without free parameters."""
     names = case.surface.region_names
     chosen: dict[str, list[float]] = {}
     for what, given in (("E_f", options.E_f), ("ratio", options.ratio)):
@@ -139,12 +139,12 @@ def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
 
 
 def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) -> FebDocument:
-    """The closure of a valve at parameters ``m (p,)``.
+    """FEBio input for the closure of a valve at parameters ``m (p,)``.
 
     Raises
     ------
     InputError, MaterialError
-        FEBio has no counterpart of the mesh, or a modulus is inadmissible.
+        FEBio has no counterpart for the mesh, or a modulus is inadmissible.
     """
     values = {**model.fixed, **dict(zip(model.names, map(float, m), strict=True))}
     mechanics, protocol = model.settings, model.settings.protocol
@@ -183,7 +183,7 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
     if options.contact != "none" and mechanics.contact.active:
         gap, reach = options.contact_gap_mm, options.contact_reach_mm
         inner = 0.5 * (gap + reach)
-        # Each pair of elements of one surface is counted twice.
+        # FEBio counts each pair of elements of one surface twice.
         kc = 0.5 * mechanics.contact.reference_pressure
         kc /= _pressure_of_sheets(gap, EXPONENT, inner, reach)
         document.touch(opposite_faces(mesh), kc=kc, p=EXPONENT, R_in=inner, R_out=reach)
@@ -208,10 +208,10 @@ def _chord_forces(system: System, ends: FloatArray) -> list[FloatArray]:
 
 
 def _pressure_of_sheets(gap: float, p: float, inner: float, outer: float) -> float:
-    r"""Pressure (MPa) between two flat sheets that are ``gap`` mm apart, for kc = 1.
+    r"""Pressure (MPa) between two flat sheets ``gap`` mm apart, for kc = 1.
 
     With the force f(r) between two points it is :math:`2 \pi d \int_d^\infty f(r) dr`, the
-    derivative of the energy :math:`2 \pi \int_d^\infty \varphi(r) r dr` by d. FEBio's force is
+    derivative of :math:`2 \pi \int_d^\infty \varphi(r) r dr` with respect to d. FEBio's force is
     :math:`r^{-p}` minus a constant up to ``inner``, and falls to zero as a parabola at ``outer``.
     """
     c1 = 0.5 * p / ((outer - inner) * inner ** (p + 1))

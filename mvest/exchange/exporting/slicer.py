@@ -25,13 +25,13 @@ from mvest.valve.geometry.triangles import principal_stretches
 
 FIELDS = "fields.npz"
 REGIONS = ("anterior", "posterior")
-"""Regions of a run, which stores their numbers only."""
+"""Region names for a run, which stores only their numbers."""
 MUSCLES = ("antero-lateral", "postero-medial")
 
 
 @dataclass(frozen=True, slots=True)
 class SlicerOptions:
-    """There are no options."""
+    """The exporter has no options."""
 
 
 def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:
@@ -41,13 +41,13 @@ def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:
     case; ``observed``, ``generic`` and ``fitted`` of a run, with displacement and stretches
     relative to the open valve, and the distance from the observed surface if the run stored it.
     ``NAME.mrk.json`` has the annulus, its SlicerHeart landmarks and the papillary tips of each
-    frame. A closure (``experiment=closure``) becomes ``closing``: thick leaflets at every stored
-    time, with first principal stress and contact pressure.
+    frame. A closure (``experiment=closure``) is written as ``closing``: thick leaflets at every
+    stored time, with first principal stress and contact pressure.
 
     Parameters
     ----------
     source
-        With ``case.yaml`` or ``fields.npz``.
+        A folder with ``case.yaml`` or ``fields.npz``.
     target
         A new folder.
     options
@@ -98,7 +98,7 @@ def _write_run(folder: Path, fields: CaseFields) -> None:
         for k, points in enumerate([fields.rest, *moved]):
             data = _deformation(fields.rest, points, fields.triangles)
             if distance is not None:
-                # The open valve has none, but Slicer needs the same arrays in all states.
+                # Slicer needs the same arrays in all states, also in the open valve.
                 data["distance_mm"] = distance[k - 1] if k else np.zeros(len(points))
             states.append(Surface(points, fields.triangles, data, cells))
         write_surface_series(folder / f"{name}.pvd", range(len(states)), states)

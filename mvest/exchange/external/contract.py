@@ -1,6 +1,6 @@
-"""The command of an external program, and the files of its requests and responses.
+"""The command of an external program, and its request and response files.
 
-Text only: JSON and comma-separated numbers. Each run has a folder::
+All files are text: JSON or comma-separated numbers. Each run has a folder::
 
     request.json      the request: parameters with values and units, settings
     points.csv        x,y,z mm: reference positions of the observed points, if given
@@ -10,7 +10,7 @@ Text only: JSON and comma-separated numbers. Each run has a folder::
                       next), one column per parameter, headed by its name
     stdout.txt, stderr.txt  the program's output
 
-Anything else is refused with the file and the row.
+Anything else raises an error that names the file and the row.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ MAX_JSON_SIZE = 1_000_000
 """Largest size of a request or response (bytes)."""
 PLACEHOLDER = re.compile(r"\{(request|folder|here)\}")
 CODE = (".jl", ".m", ".py", ".r", ".sh")
-"""Suffixes of scripts, which may import other scripts of their folder."""
+"""Suffixes of scripts, which may import other scripts from their folder."""
 
 
 def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -> dict[str, Path]:
-    """Files that a command names and that exist; a prediction depends on their content.
+    """Existing files named in a command; a prediction depends on their content.
 
-    These are the program, arguments that are files (also behind a ``=``), and all scripts of the
-    same kind next to a script. Files that only the program knows are not found: its libraries,
-    files named within files, modules of ``python -m``. Parameters are those of `Command`.
+    These are the program, arguments that are files (also after a ``=``), and all scripts of the
+    same kind in a script's folder. Files that only the program knows are not found: its libraries,
+    files named in other files, modules of ``python -m``. Parameters are those of `Command`.
     """
     here, files = str(Path.cwd()), dict[str, Path]()
     path = {**os.environ, **environment}.get("PATH")
@@ -62,8 +62,8 @@ def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -
             files[program] = Path(found).absolute()
     for name in (name for text in arguments for name in (text, text.partition("=")[2])):
         place = Path(name.replace("{here}", here))
-        with contextlib.suppress(OSError, ValueError):  # a text that cannot be a file name
-            # Files of the run itself are named by placeholders, or relative to its folder.
+        with contextlib.suppress(OSError, ValueError):  # not a valid file name
+            # The run's own files are named by placeholders, or relative to its folder.
             if place.is_absolute() and place.is_file():
                 files[name] = place
     for script in [file for file in files.values() if file.suffix.lower() in CODE]:
@@ -74,7 +74,7 @@ def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """How to start a program, and how long it may take.
+    """How to start a program, and its time limit.
 
     Raises
     ------
@@ -82,11 +82,11 @@ class Command:
         The program does not exist, or the limit is not positive.
     """
 
-    #: the program and its arguments; no shell reads them. ``{request}`` and ``{folder}`` become the
-    #: request file and the folder of the run, in which the program runs; ``{here}`` becomes the
+    #: the program and its arguments, not interpreted by a shell. ``{request}`` and ``{folder}`` are
+    #: replaced by the request file and the run's folder, where the program runs; ``{here}`` by the
     #: working folder of this process.
     arguments: tuple[str, ...]
-    #: variables in addition to those of this process
+    #: environment variables added to those of this process
     environment: Mapping[str, str] = field(default_factory=dict)
     time_limit_s: float = 600.0  #: the program and all its children are stopped after this time
 
@@ -112,8 +112,8 @@ class Command:
         children stop at the time limit, when the program ends, and when the context is left.
         """
         limit = time.monotonic() + self.time_limit_s
-        # `mvest.processes.side_by_side` sets this variable. Programs may import what lies next to
-        # them.
+        # `mvest.processes.side_by_side` sets this variable. Programs may import files from their
+        # own folder.
         inherited = {k: value for k, value in os.environ.items() if k != "PYTHONSAFEPATH"}
         with contextlib.ExitStack() as stack:
             try:
@@ -169,7 +169,7 @@ class _Message(BaseModel):
 
 
 class RunRequest(_Message):
-    """The request of one run, as ``request.json`` holds it."""
+    """The request of one run, as stored in ``request.json``."""
 
     parameters: tuple[RequestParameter, ...] = Field(min_length=1)  # (p,)
     points: int = Field(ge=1)  # number of observed points
@@ -207,7 +207,7 @@ def write_request(folder: Path, request: RunRequest, points: FloatArray | None =
 
 
 def read_request(file: Path) -> RunRequest:
-    """Read ``request.json`` (for the program); raises an InputError if it is no request."""
+    """Read ``request.json`` (for the program); raise an InputError if it is invalid."""
     return validated(RunRequest, read_mapping(file, MAX_JSON_SIZE), str(file))
 
 
@@ -231,7 +231,7 @@ def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | No
 
 
 def read_answer(folder: Path, request: RunRequest) -> Prediction:
-    """Read the response of a run; without ``jacobian.csv`` it is undifferentiated.
+    """Read the response of a run; without ``jacobian.csv`` it has no derivatives.
 
     Raises
     ------
@@ -254,7 +254,7 @@ def read_points(file: Path, count: int | None = None) -> FloatArray:
     Raises
     ------
     InputError
-        The file is no such table, or has other than ``count`` rows.
+        The file is not such a table, or does not have ``count`` rows.
     """
     return _read_table(file, COORDINATES, count)
 

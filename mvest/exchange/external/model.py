@@ -1,6 +1,6 @@
-"""A program as an observation model: parameters in, positions and derivatives out, all in files.
+"""An external program as an observation model: parameters in, positions and derivatives out.
 
-If the program gives no derivatives, they are differences of its predictions.
+All data pass through files. Without derivatives from the program, differences are used.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from mvest.typing import FloatArray
 class Differences:
     """Central difference quotients ``(h(m + d) - h(m - d)) / 2d``: two runs per parameter.
 
-    Their error is of second order in the step. The tolerance of the program's solver adds an error
-    of tolerance over step: choose a step much larger than the tolerance.
+    The error is second order in the step. The program's solver tolerance adds an error of tolerance
+    over step, so choose a step much larger than the tolerance.
     """
 
-    relative_step: float = 1e-3  #: step over the size of a parameter
-    floor: float = 0.0  #: least size of a parameter, in its unit; needed if it may be zero
+    relative_step: float = 1e-3  #: step relative to the size of a parameter
+    floor: float = 0.0  #: smallest size of a parameter, in its unit; needed if it may be zero
     processes: int = 1  #: number of simultaneous runs
 
     def __post_init__(self) -> None:
@@ -49,7 +49,7 @@ class Differences:
             )
 
     def neighbours(self, m: FloatArray) -> FloatArray:
-        """Parameters ``(2 p, p)`` of the runs: upper neighbours of ``m``, then lower ones.
+        """Parameters ``(2 p, p)`` of the runs: upper neighbours of ``m``, then lower neighbours.
 
         Raises
         ------
@@ -69,9 +69,9 @@ class Differences:
 class ProcessModel:
     """Coordinates ``(3 n,)`` mm that a program predicts for parameters ``(p,)``.
 
-    This is an observation model for the filters: a run that fails is a failed prediction with a
-    reason. Each run has its own folder below ``folder``. Converged runs are reused, so that an
-    interrupted study goes on where it stopped.
+    This is an observation model for the filters: a failed run gives a failed prediction with a
+    reason. Each run has its own folder below ``folder``. Converged runs are reused, so an
+    interrupted study resumes where it stopped.
 
     Parameters
     ----------
@@ -85,19 +85,19 @@ class ProcessModel:
     units : sequence of str, optional
         Units of the parameters.
     points : ndarray, optional
-        ``(n, 3)`` mm, reference positions of the observed points for the program.
+        ``(n, 3)`` mm, reference positions of the observed points, passed to the program.
     settings : mapping, optional
-        Plain data for the program.
+        Plain data, passed to the program.
     inputs : sequence of str
-        Files and folders on which the predictions depend, besides those that the command names. A
-        run is not reused if the content of any of them has changed.
+        Files and folders that affect the predictions, in addition to those named in the command. A
+        run is not reused if any of their contents has changed.
     differences : Differences or None
-        How to differentiate if the program does not; None requires derivatives of the program.
+        How to differentiate if the program does not; None requires it to.
 
     Raises
     ------
     InputError, ConfigurationError
-        The folder cannot be made, or points, names and units do not fit.
+        The folder cannot be created, or points, names and units are inconsistent.
     """
 
     command: Command
@@ -110,7 +110,7 @@ class ProcessModel:
     settings: Mapping[str, Any] | None = None
     inputs: Sequence[str] = ()
     differences: Differences | None = Differences()
-    runs: int = field(default=0, init=False)  #: number of runs that were started
+    runs: int = field(default=0, init=False)  #: number of started runs
     #: whether the program itself gave the last derivatives
     own_jacobian: bool = field(default=False, init=False)
 
@@ -141,7 +141,7 @@ class ProcessModel:
         return Prediction.failed(found) if isinstance(found, str) else Prediction(first.y, found)
 
     def by_differences(self, m: FloatArray) -> FloatArray | str:
-        """Derivatives ``(3 n, p)`` of the prediction at ``m``, or why there are none."""
+        """Derivatives ``(3 n, p)`` of the prediction at ``m``, or the reason why there are none."""
         if self.differences is None:
             return "no derivatives: jacobian.csv is missing, differences=none"
         try:
@@ -157,7 +157,7 @@ class ProcessModel:
                     return f"run for a difference at {values}: {one.reason}"
                 found.append(one)
         upper, lower = np.split(np.array([one.y for one in found]), 2)
-        steps = np.diagonal(points[: m.size] - points[m.size :])  # after rounding
+        steps = np.diagonal(points[: m.size] - points[m.size :])  # the steps after rounding
         return np.asarray((upper - lower).T / steps)
 
     def _request(self, m: FloatArray, jacobian: bool) -> RunRequest:
@@ -171,7 +171,7 @@ class ProcessModel:
         return validated(RunRequest, request, "request")
 
     def _folder(self, request: RunRequest) -> Path:
-        """The folder of a run, named by everything that decides its result."""
+        """The folder of a run, named after a hash of everything that affects its result."""
         points = None if self.points is None else self.points.tolist()
         command = self.command
         files = {str(path): path for path in map(Path, self.inputs)}
@@ -185,7 +185,7 @@ class ProcessModel:
         return self.folder / f"run-{config_hash(content)[:16]}"
 
     def _predictions(self, points: FloatArray, jacobian: bool) -> list[Prediction]:
-        """Predictions at all points at the same time; an exception ends all programs."""
+        """Predictions at all points, run in parallel; an exception stops all programs."""
         with ExitStack() as stack:
             started = []
             for request in [self._request(m, jacobian) for m in points]:
@@ -205,9 +205,9 @@ class ProcessModel:
 
 
 def _result(folder: Path, request: RunRequest, failure: str) -> Prediction:
-    """The prediction of a run; ``failure`` is why the program failed, or empty.
+    """The prediction of a run; ``failure`` is the reason why the program failed, or empty.
 
-    A failed run loses its response, so that it is not reused.
+    The response of a failed run is deleted, so that it is not reused.
     """
     try:
         answer = read_answer(folder, request)

@@ -1,18 +1,18 @@
-r"""FEBio's input file, its elements and materials, after the reader of FEBio 4.11 (``FEBioXML``).
+r"""FEBio's input file, elements and materials, following the FEBio 4.11 reader (``FEBioXML``).
 
-Numbers keep all digits.
+Numbers are written with all digits.
 
 FEBio has no linear law of the Biot strain, :math:`\tfrac12 \epsilon : C : \epsilon`
 (:mod:`mvest.mechanics.law.biot`). Two of its materials have the same stiffness at rest:
 
 ``orthotropic``
-    ``orthotropic elastic``: the same C, of the Green-Lagrange strain (St. Venant's law).
+    ``orthotropic elastic``: the same C applied to the Green-Lagrange strain (St. Venant's law).
 ``neo-hookean``
     ``neo-Hookean transiso``: the same moduli in a neo-Hookean form.
 
 Node orders follow FEBio's shape functions (``FESolidElementShape.cpp``): corners of the lower face
 counterclockwise, corners of the upper face, midpoints of the lower, the upper and the upright
-edges; then, of a brick, midpoints of its sides, of the lower and the upper face, and its centre.
+edges; for a brick also the midpoints of its sides, its lower and its upper face, and its centre.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ LAWS = {"orthotropic": "orthotropic elastic", "neo-hookean": "neo-Hookean transi
 BRICK = np.array([0, 2, 8, 6, 18, 20, 26, 24, 1, 5, 7, 3, 19, 23, 25, 21, 9, 11, 17, 15, 10, 14, 16,
                   12, 4, 22, 13])  # fmt: skip
 WEDGE = np.array([0, 1, 2, 12, 13, 14, 3, 4, 5, 15, 16, 17, 6, 7, 8])
-"""Nodes of hex27 and wedge18 in FEBio's order; FEBio's wedge has no midpoints of its sides."""
+"""Nodes of hex27 and wedge18 in FEBio's order; FEBio's wedge has no side midpoints."""
 QUADRILATERAL = np.array([0, 2, 8, 6, 1, 5, 7, 3, 4])
-"""Nodes of quad9 in FEBio's order; triangles have the same order."""
+"""Nodes of quad9 in FEBio's order; triangles need no reordering."""
 NAMES = {
     "tet4": ("tet4", {}, np.arange(4)),
     "tet10": ("tet10", {"elem_type": "TET10G4"}, np.arange(10)),
@@ -53,22 +53,22 @@ NAMES = {
 }
 """Element -> FEBio's name, integration rule if there is a choice, and nodes."""
 UPRIGHT = {"hex18": "hex27", "wedge12": "wedge18"}
-"""Elements that get nodes halfway through the thickness."""
+"""Elements that need extra nodes halfway through the thickness."""
 AXES = ("x", "y", "z")
 SECTIONS = ("Module", "Control", "Material", "Mesh", "MeshDomains", "MeshData", "Boundary", "Loads",
             "Contact", "Constraints", "Discrete", "LoadData", "Output")  # fmt: skip
-"""In the order in which FEBio can resolve names."""
+"""Sections in an order that lets FEBio resolve names."""
 UPDATES = 10
-"""BFGS updates; FEBio's tangent of its neo-Hookean law is not exact."""
+"""BFGS updates; FEBio's tangent for its neo-Hookean law is not exact."""
 
 
 def febio_law(tissue: TransverselyIsotropic, kind: str = "orthotropic") -> FebLaw:
-    """The material of FEBio, one of `LAWS`, for the tissue of one region."""
+    """The FEBio material, one of `LAWS`, for the tissue of one region."""
     if kind == "neo-hookean":
         return {"type": LAWS[kind], "Ep": tissue.E_p, "Ez": tissue.E_f, "vz": tissue.nu_fp,
                 "vp": tissue.nu_pp, "gz": tissue.G}  # fmt: skip
     across = tissue.E_p / (2 * (1 + tissue.nu_pp))
-    # v31 / E3 is the compliance that v13 / E1 is.
+    # The compliance is symmetric: v31 / E3 = v13 / E1.
     return {
         "type": LAWS[kind], "E1": tissue.E_f, "E2": tissue.E_p, "E3": tissue.E_p,
         "G12": tissue.G, "G23": across, "G31": tissue.G,
@@ -77,7 +77,7 @@ def febio_law(tissue: TransverselyIsotropic, kind: str = "orthotropic") -> FebLa
 
 
 def febio_mesh(mesh: SolidMesh) -> SolidMesh:
-    """The mesh with elements of `NAMES`; its first nodes are those of ``mesh``.
+    """The mesh converted to elements in `NAMES`; the nodes of ``mesh`` come first.
 
     Elements with two layers of nodes get a third one halfway between them.
 
@@ -109,7 +109,7 @@ def febio_mesh(mesh: SolidMesh) -> SolidMesh:
 
 
 def opposite_faces(mesh: SolidMesh) -> IntArray:
-    """Faces ``(f, k)`` on the side of the leaflets opposite to the pressure, normals outward.
+    """Faces ``(f, k)`` on the unpressurised side of the leaflets, normals outward.
 
     These are the outer faces whose normal is opposite to that of the nearest pressure face.
     """
@@ -128,14 +128,14 @@ def opposite_faces(mesh: SolidMesh) -> IntArray:
 
 
 class FebDocument:
-    """A body; each method adds something that acts on it.
+    """One body; each method adds a load, constraint or interaction.
 
-    ``mesh`` has elements of FEBio (`febio_mesh`), ``laws`` one per
-    region. ``end`` is the end, ``step`` the first and largest time step (s). ``tolerance`` is the
-    relative one of displacements; its square is that of the energy. ``dynamic`` means inertia (the
-    generalised alpha rule at its most dissipative) and BFGS, otherwise static by Newton's method.
-    ``further (k, 3)`` mm are nodes without elements, numbered after those of the mesh. ``density``
-    is in t/mm^3.
+    ``mesh`` has FEBio elements (`febio_mesh`); ``laws`` has one material per region. ``end`` (s) is
+    the end time, ``step`` (s) the first and largest time step. ``tolerance`` is relative for
+    displacements; its square applies to the energy. ``dynamic`` uses inertia (generalised alpha at
+    its most dissipative) and BFGS; otherwise the run is static with Newton's method. ``further
+    (k, 3)`` mm are nodes without elements, numbered after those of the mesh. ``density`` is in
+    t/mm^3.
     """
 
     def __init__(
@@ -202,9 +202,9 @@ class FebDocument:
         curve: FloatArray,
         axes: Sequence[str] = AXES,
     ) -> None:
-        """Move nodes ``(k,)`` by ``displacement (k, 3)`` mm along some axes; zeros fix them.
+        """Prescribe ``displacement (k, 3)`` mm of nodes ``(k,)`` along some axes; zeros fix them.
 
-        ``curve (c, 2)`` are times and shares.
+        ``curve (c, 2)`` gives times (s) and the fraction applied.
         """
         _add(self._at["Mesh"], "NodeSet", nodes + 1, name=name)
         for axis, values in zip(AXES, displacement.T, strict=True):
@@ -231,7 +231,7 @@ class FebDocument:
         _fill(load, symmetric_stiffness=0, linear=0)
 
     def damp(self, alpha: float) -> None:
-        """Damping by mass (1/s)."""
+        """Add mass-proportional damping (1/s)."""
         _fill(_add(self._at["Loads"], "body_load", type="mass damping"), C=alpha)
 
     def average(self, nodes: IntArray, of: Embedding) -> None:
@@ -262,10 +262,10 @@ class FebDocument:
         _fill(material, E=1e-12)
 
     def pull(self, pairs: IntArray, forces: Sequence[FloatArray]) -> None:
-        """Springs between nodes ``(k, 2)``.
+        """Add springs between nodes ``(k, 2)``.
 
-        Each force ``(p, 2)`` is elongation from the initial length (mm) and force (N), linear
-        between and beyond the points.
+        Each force ``(p, 2)`` tabulates elongation from the initial length (mm) and force (N); it is
+        linear between and beyond the points.
         """
         for k, (pair, force) in enumerate(zip(pairs, forces, strict=True)):
             material = self._spring(f"spring_{k}", pair[None])
@@ -276,7 +276,7 @@ class FebDocument:
             _points(function, force)
 
     def touch(self, faces: IntArray, **parameters: float) -> None:
-        """Contact potential between faces of the mesh, with FEBio's parameters."""
+        """Add a contact potential between faces of the mesh, with FEBio's parameters."""
         self._surface("atrial", faces)
         pair = _add(self._at["Mesh"], "SurfacePair", name="atrial_pair")
         _fill(pair, primary="atrial", secondary="atrial")
@@ -313,7 +313,7 @@ class FebDocument:
         shape = mesh.reference.shape(mesh.reference.centre)[0]
         for j, along in enumerate(np.einsum("a,mai->mi", shape, mesh.fibre[own]), start=1):
             a = along / np.linalg.norm(along)
-            # d is any other direction: the laws are isotropic around the fibre.
+            # d may be any other direction: the laws are isotropic around the fibre.
             _fill(_add(data, "elem", lid=j), a=a, d=np.roll(a, 1) + np.array([0.1, 0.2, 0.3]))
 
     def _surface(self, name: str, faces: IntArray) -> None:
@@ -323,7 +323,7 @@ class FebDocument:
             _add(surface, self._face, face, id=k)
 
     def _spring(self, name: str, pairs: IntArray) -> Xml.Element:
-        """An empty material of springs between nodes ``(k, 2)``."""
+        """An empty spring material for nodes ``(k, 2)``."""
         connected = _add(self._at["Mesh"], "DiscreteSet", name=name)
         for pair in pairs:
             _add(connected, "delem", pair + 1)
@@ -341,7 +341,7 @@ def positions_file(path: Path) -> Path:
 
 
 def _sums(of: Embedding) -> list[list[tuple[int, float]]]:
-    """Numbers of the nodes of each weighted sum, and their weights."""
+    """The node numbers and weights of each weighted sum."""
     rows = zip((of.nodes + 1).tolist(), of.weights.tolist(), strict=True)
     return [[term for term in zip(*row, strict=True) if term[1]] for row in rows]
 

@@ -1,5 +1,5 @@
-"""Importers of cases from the files of other programs, one module per source.
+"""Importers that make cases from other programs' files, one module per source.
 
-A module NAME has ``import_NAME(source, options)``, which makes a `mvest.cases.case.ValveCase`, and
-the frozen dataclass of its options. ``mvest import NAME`` finds both by these names.
+A module NAME defines ``import_NAME(source, options)``, which makes a `mvest.cases.case.ValveCase`,
+and a frozen options dataclass. ``mvest import NAME`` finds both by name.
 """

@@ -2,8 +2,8 @@
 
 Each leaflet is a disc: its boundary runs along the annulus from one commissure to the other, and
 back along the free edge. At a commissure the boundaries of both leaflets run side by side before
-the free edges part; there a strip of triangles joins them. The band is then remeshed on the lines
-of its own coordinates, with triangles of equal size.
+the free edges part; a strip of triangles joins them there. The band is then remeshed along its
+coordinate lines, with triangles of equal size.
 """
 
 from __future__ import annotations
@@ -33,33 +33,33 @@ COINCIDENT = 1e-6
 EDGE_MM = 1.0
 """Mean edge length of the triangles of a band."""
 SEAM_MM = 1.5
-"""Largest distance over which boundaries are joined at a commissure."""
+"""Largest gap between boundaries that is bridged at a commissure."""
 MAX_HOLE = 0.2
-"""Largest length of a hole's boundary over that of the leaflet; such holes are closed."""
+"""Holes are closed if their boundary, relative to that of the leaflet, is at most this long."""
 MAX_GAP = 6.0
-"""Largest distance (mm) of the leaflets at a commissure, and of a commissure from the leaflets."""
+"""Largest distance (mm) between leaflets at a commissure, and of a commissure from them."""
 MAX_MISS = 8.0
 """Largest distance (mm) along a leaflet's boundary of a marked commissure from the true one."""
 CORNER, SETTLED = 3.0, 0.15
-"""Length (mm) behind the corner over which the distance to the other leaflet falls by at most the
-second number (mm)."""
+"""At a corner the distance to the other leaflet comes within the second length (mm) of its smallest
+value, which is searched over the first length (mm)."""
 OPENING = 0.4
-"""Increase of the distance (mm) over that at the corner where free edges begin to part."""
+"""Free edges begin to part where their distance exceeds that at the corner by this (mm)."""
 CURL_AT, CURLED = (0.0, 0.6, 1.5, 2.5), 0.85
-"""Distances (mm) from an edge, and the largest cosine between the directions in the first and the
-last interval of a side that curls round a rim (32 degrees or more; other surfaces have under 10).
+"""A side curls round a rim if its directions in the first and last interval between these distances
+(mm) from an edge have at most this cosine (32 degrees or more; other surfaces have under 10).
 """
 RIM_ROUNDS = 2
-"""Rounds of smoothing of an edge."""
+"""Smoothing iterations of an edge."""
 MAX_SEAM = 0.25
-"""Largest share of a free edge, from commissure to commissure, that is joined."""
+"""Largest joined fraction of a free edge, from commissure to commissure."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leaflet:
     """One leaflet as a disc: ``(n, 3)`` mm, ``(m, 3)``, and its boundary ``(k,)``.
 
-    ``loop`` has the direction of the triangles; ``holes`` is the number of closed holes.
+    ``loop`` follows the triangles' orientation; ``holes`` is the number of holes that were closed.
     """
 
     vertices: FloatArray
@@ -74,7 +74,7 @@ class Leaflet:
         Raises
         ------
         GeometryError
-            It is closed, not a manifold, or has a second long boundary.
+            The piece is closed, not a manifold, or has a second long boundary.
         """
         whole = merged(Surface(vertices, triangles))
         points, faces = whole.vertices, whole.triangles
@@ -111,7 +111,7 @@ class Leaflet:
         return self.vertices[self.loop]
 
     def arcs(self, ends: FloatArray) -> tuple[IntArray, IntArray]:
-        """The loop between the vertices nearest to two points ``(2, 3)``, and the rest.
+        """The part of the loop between the vertices nearest to two points ``(2, 3)``, and the rest.
 
         Both arcs include both ends.
         """
@@ -132,12 +132,12 @@ def loop_length(curve: FloatArray) -> float:
 
 
 def commissures_on(contour: FloatArray, leaflets: Sequence[Leaflet]) -> FloatArray:
-    """The two points ``(2, 3)`` of a contour where the nearer leaflet changes.
+    """The two points ``(2, 3)`` of a contour at which the nearer leaflet changes.
 
     Raises
     ------
     GeometryError
-        There are other than two changes.
+        The nearer leaflet does not change exactly twice.
     """
     distance = [_nearest(contour, leaflet.curve)[0] for leaflet in leaflets]
     difference = distance[0] - distance[1]  # smoothed over a few mm
@@ -161,22 +161,22 @@ def joined(
     offset_mm: tuple[float, float],
     seams: FloatArray | None = None,
 ) -> tuple[Surface, FloatArray, float]:
-    """Join the anterior and the posterior leaflet to a band that faces the ventricle.
+    """Join the anterior and posterior leaflets into a band that faces the ventricle.
 
     Parameters
     ----------
     leaflets
         Anterior, posterior.
     commissures, contour
-        ``(2, 3)`` mm; ``(k, 3)`` mm, closed curve along the annulus, or None.
+        ``(2, 3)`` mm; closed curve along the annulus, ``(k, 3)`` mm, or None.
     down
-        ``(3,)`` from the annulus to the ventricle.
+        ``(3,)`` direction from the annulus to the ventricle.
     offset_mm
         Shifts of the anterior and the posterior leaflet towards the ventricle: half a thickness
         turns an atrial surface into the midsurface.
     seams : (2, 2) or None
-        Joined share of each leaflet's free edge (columns) at each commissure (rows). A closed
-        valve, whose edges touch all along, needs that of an open frame.
+        Joined fraction of each leaflet's free edge (columns) at each commissure (rows). A closed
+        valve needs the value of an open frame, because its edges touch all along.
 
     Returns the surface with the regions 0 (anterior) and 1 (posterior), the seams, and the largest
     width (mm) of the strips of triangles.
@@ -184,8 +184,8 @@ def joined(
     Raises
     ------
     GeometryError
-        The commissures are not at the leaflets, the surfaces are not leaflets, or the coordinates
-        of the band fold over.
+        The commissures are far from the leaflets, the surfaces are not leaflets, or the band's
+        coordinates fold over.
     """
     for name, leaflet in zip(REGIONS, leaflets, strict=True):
         away = float(_nearest(commissures, leaflet.curve)[0].max())
@@ -210,7 +210,7 @@ def joined(
     region = [np.full(len(own), k) for k, own in enumerate(faces)]
     edges = (arcs[1], others[1] + len(front.vertices))
     same, shares, gaps = np.arange(len(vertices)), np.zeros((2, 2)), []
-    # Where the free edge of one leaflet begins, that of the other one ends.
+    # One leaflet's free edge begins where the other's ends.
     for k in range(2):
         a, b = edges[k], edges[1 - k][::-1]
         given = None if seams is None else (seams[k, k], seams[k, 1 - k])
@@ -244,13 +244,13 @@ def _facing_ventricle(
     contour: FloatArray | None,
     down: FloatArray,
 ) -> tuple[Leaflet, IntArray, IntArray]:
-    """The leaflet with its triangles facing the ventricle, its arcs of annulus and free edge."""
+    """The leaflet oriented towards the ventricle, and its arcs of annulus and free edge."""
     turned = replace(leaflet, triangles=leaflet.triangles[:, ::-1], loop=leaflet.loop[::-1])
     for candidate in (leaflet, turned):
         arcs = candidate.arcs(commissures)
         to = other.vertices if contour is None else contour
         away = [float(_nearest(candidate.vertices[arc], to)[0].mean()) for arc in arcs]
-        # The annulus is nearer to the contour, or else farther from the other leaflet.
+        # The annulus is the arc nearer to the contour, or else farther from the other leaflet.
         annulus = arcs[int(np.argmax(away) if contour is None else np.argmin(away))]
         ring = np.vstack([candidate.vertices[annulus], other.curve.mean(0)])
         if loop_vector_area(ring) @ down > 0:
@@ -261,8 +261,8 @@ def _facing_ventricle(
 def _cornered(leaflet: Leaflet, rough: IntArray, other: Leaflet) -> tuple[IntArray, IntArray]:
     """Arcs of annulus and free edge, split at the corners of the leaflet.
 
-    Commissures are marked with errors of some mm. Along the annulus the other leaflet comes nearer
-    up to the corner, behind which the two boundaries run side by side.
+    Marked commissures are wrong by a few mm. Along the annulus the other leaflet comes nearer up to
+    the corner; past it the two boundaries run side by side.
     """
     middle = len(rough) // 2
     loop = np.roll(leaflet.loop, -int(np.flatnonzero(leaflet.loop == rough[middle])[0]))
@@ -287,7 +287,7 @@ def _cornered(leaflet: Leaflet, rough: IntArray, other: Leaflet) -> tuple[IntArr
 
 
 def _along(curve: FloatArray) -> FloatArray:
-    """Length (mm) of a curve ``(k, 3)`` up to each of its points."""
+    """Arc length (mm) of a curve ``(k, 3)`` up to each point."""
     return np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
 
 
@@ -296,7 +296,7 @@ def _shares(curve: FloatArray) -> FloatArray:
 
 
 def _seam(a: FloatArray, b: FloatArray, given: tuple[float, float] | None) -> tuple[int, int]:
-    """Last joined points, 1 or more, of two curves that begin side by side."""
+    """Indices (at least 1) of the last joined points of two curves that begin side by side."""
     shares = _shares(a), _shares(b)
     if given is None:
         distance, nearest = _nearest(a, b)
@@ -313,10 +313,10 @@ def _seam(a: FloatArray, b: FloatArray, given: tuple[float, float] | None) -> tu
 
 
 def _strip(vertices: FloatArray, a: IntArray, b: IntArray) -> tuple[IntArray, IntArray, float]:
-    """Triangles between two rows of vertices, the row with two corners of each, and their width.
+    """Triangles between two rows of vertices, the row with two of their corners, and the width.
 
-    The first row runs along the boundary of its leaflet, the second one against it. The next
-    triangle is the one with the shorter new edge.
+    The first row follows its leaflet's boundary, the second opposes it. The next triangle is the
+    one with the shorter new edge.
     """
     x, y = vertices[a], vertices[b]
     across = np.pad(np.linalg.norm(x[:, None] - y, axis=2), (0, 1), constant_values=np.inf)
@@ -332,7 +332,7 @@ def _strip(vertices: FloatArray, a: IntArray, b: IntArray) -> tuple[IntArray, In
 
 
 def _nearest(points: FloatArray, to: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Distance ``(k,)`` of each point ``(k, 3)`` to the nearest of others, and its number."""
+    """Distance ``(k,)`` from each point ``(k, 3)`` to the nearest one in ``to``, and its index."""
     distance, number = cKDTree(to).query(points)
     return np.atleast_1d(distance), np.atleast_1d(number)
 
@@ -340,8 +340,8 @@ def _nearest(points: FloatArray, to: FloatArray) -> tuple[FloatArray, IntArray]:
 def _drawn(
     band: LeafletBand, grid: BandGrid, columns: int, offset_mm: tuple[float, float]
 ) -> Surface:
-    """A band remeshed on the lines of its coordinates and shifted along its normals."""
-    # The angle of the grid runs against that of the band; both have the anterior leaflet in 0-180.
+    """A band remeshed along its coordinate lines and shifted along its normals."""
+    # The grid's angle is opposite to the band's; in both, the anterior leaflet spans 0-180.
     phi = np.mod(180.0 - grid.phi, 360.0)
     rows = band.position(phi, grid.s).reshape(-1, columns, 3)
     rows = _smooth_rims(_flat_part(rows, np.where(phi[:columns] < 180, *offset_mm)))
@@ -353,10 +353,10 @@ def _drawn(
 
 
 def _flat_part(rows: FloatArray, offset_mm: FloatArray) -> FloatArray:
-    """Rows ``(r, k, 3)`` of a band without edges that curl round the rims of leaflets.
+    """Rows ``(r, k, 3)`` of a band, clipped where its edges curl round the leaflet rims.
 
-    The side of a thick leaflet includes half of its rim: a quarter of a circle, whose radius
-    ``(k,)`` is the shift of the side.
+    The side of a thick leaflet includes half of its rim: a quarter circle with the side's shift
+    ``(k,)`` as radius.
     """
     step = np.linalg.norm(np.diff(rows, axis=0), axis=2)
     along = np.vstack([np.zeros(rows.shape[1]), np.cumsum(step, axis=0)])
@@ -384,9 +384,9 @@ def _flat_part(rows: FloatArray, offset_mm: FloatArray) -> FloatArray:
 
 
 def _smooth_rims(rows: FloatArray) -> FloatArray:
-    """Rows ``(r, k, 3)`` with the first and the last curve smoothed, and their neighbours less.
+    """Rows ``(r, k, 3)`` with the first and last curve smoothed, and their neighbours less so.
 
-    A clipped edge is as rough as its triangles, and has a kink where the free edges part.
+    A clipped edge is as rough as its triangles and has a kink where the free edges part.
     """
     result = rows.copy()
     for end, inwards in ((0, 1), (len(rows) - 1, -1)):

@@ -1,4 +1,4 @@
-"""Which voxels or closed surfaces of a source are which leaflet."""
+"""Identifies the voxels or closed surfaces of each leaflet in a source."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from mvest.valve.geometry.leaflet_fields import STEP_MM, inside_surfaces
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 
 TERMS = {"anterior": "sh-leaflet-mv-a", "posterior": "sh-leaflet-mv-p"}
-"""Codes of SlicerHeart's terminology for the leaflets of the mitral valve."""
+"""SlicerHeart's terminology codes for the mitral leaflets."""
 WORDS = {
     "anterior": {"anterior", "aml", "amvl", "a1", "a2", "a3"},
     "posterior": {"posterior", "pml", "pmvl", "p1", "p2", "p3"},
 }
-"""Words in the names of leaflets, and of their scallops (Carpentier)."""
+"""Words that name leaflets, and scallops (Carpentier)."""
 SCALLOPS = {"a1", "a2", "a3", "p1", "p2", "p3"}
 OTHERS = {"papillary", "muscle", "commissure", "annulus", "chordae", "tricuspid", "aortic"}
-"""Words in the names of other structures."""
+"""Words that name other structures."""
 VALVE_MM = (10.0, 120.0)
-"""Size of a valve."""
+"""Plausible size of a valve."""
 Content: TypeAlias = Surface | LabelMap
 Grid: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Spacing, direction and origin of voxels, as in `mvest.exchange.volumes.LabelMap`."""
@@ -39,12 +39,12 @@ Grid: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tissue:
-    """The leaflets of one frame: both together, or the anterior and the posterior one."""
+    """The leaflets of one frame, either both together or anterior and posterior separately."""
 
     masks: tuple[BoolArray, ...]  # (I, J, K) each
     grid: Grid
-    surface: tuple[FloatArray, IntArray] | None = None  # of both leaflets, in place of masks
-    nameless: tuple[str, ...] = ()  # two labels whose names do not say which leaflet they are
+    surface: tuple[FloatArray, IntArray] | None = None  # of both leaflets, replaces masks
+    nameless: tuple[str, ...] = ()  # two labels whose names do not identify a leaflet
 
     @property
     def points(self) -> FloatArray:
@@ -57,7 +57,7 @@ class Tissue:
 
 
 def filled_frames(labels: LabelMap) -> list[int]:
-    """Numbers of the frames or layers with labels."""
+    """Indices of the frames or layers that contain labels."""
     filled: list[int] = np.flatnonzero(labels.frames.any(axis=(1, 2, 3))).tolist()
     return filled
 
@@ -69,19 +69,18 @@ def tissue_of(
     scale: float,
     derived: list[str],
 ) -> Tissue:
-    """The leaflets of a frame; all but a single closed surface become voxels.
+    """The leaflets of a frame, as voxels unless they are a single closed surface.
 
-    ``contents`` are those of one file, or of the files of the anterior and of the posterior
-    leaflet. ``frame`` is that of a label map over time (None: the first with labels), or the only
-    layer of a segmentation to use (None: all). ``given`` has names or numbers of the parts that are
-    the ``anterior`` and the ``posterior`` leaflet, or both (``leaflets``); by default terminology
-    and names decide. ``scale`` is mm per unit of surfaces. Sentences about used and unused parts
-    are appended to ``derived``.
+    ``contents`` come from one file, or from one file for each leaflet. ``frame`` selects a frame of
+    a label map over time (None: the first with labels), or one layer of a segmentation (None: all).
+    ``given`` has the names or numbers of the parts of the ``anterior`` and the ``posterior``
+    leaflet, or of both (``leaflets``); by default terminology and names decide. ``scale`` is mm per
+    unit of surfaces. Sentences about used and unused parts are appended to ``derived``.
 
     Raises
     ------
     InputError, GeometryError
-        Leaflets are not recognised, files do not fit each other, surfaces are defective.
+        Leaflets are not recognised, files are inconsistent, or surfaces are defective.
     """
     chosen = [_parts(content, frame) for content in contents]
     nameless: tuple[str, ...] = ()
@@ -118,7 +117,7 @@ def tissue_of(
 class _Part:
     """A segment, label or object, and a function that gives its voxels or surface.
 
-    Nameless labels have their number as name.
+    A nameless label has its number as name.
     """
 
     name: str
@@ -133,7 +132,7 @@ class _Part:
 
 
 def _parts(content: Content, frame: int | None) -> list[_Part]:
-    """The parts of a file that are not empty."""
+    """The non-empty parts of a file."""
     if isinstance(content, Surface):
         names = sorted(set(content.groups))
         if len(names) < 2:
@@ -163,7 +162,7 @@ def _object(surface: Surface, name: str) -> Surface:
 def _chosen(
     parts: Sequence[_Part], given: Mapping[str, Sequence[str]], derived: list[str]
 ) -> tuple[list[list[_Part]], tuple[str, ...]]:
-    """The parts of both leaflets together or of each, and the names of two nameless ones."""
+    """The parts of both leaflets together or of each, and the names of two nameless parts."""
     both, *chosen = (
         [_called(parts, word) for word in given.get(name, ())] for name in ("leaflets", *REGIONS)
     )

@@ -1,4 +1,4 @@
-"""Thick segmented leaflets: label maps, or closed surfaces of each leaflet or of both."""
+"""Imports thick segmented leaflets: label maps, or closed surfaces of one or both leaflets."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from mvest.valve.geometry.segmented import (
 )
 
 OBSERVER_MM, CORRELATED_MM = 1.0, 10.0
-"""Standard deviation of walls drawn by a person or a network, and the length along the leaflets
-over which these errors are correlated: the values of a case that states none."""
+"""Defaults for a case: standard deviation of walls drawn by a person or a network, and the length
+along the leaflets over which these errors are correlated."""
 BLUR_VOXELS = 0.5
-"""Standard deviation of the smoothing of voxels."""
+"""Standard deviation of the voxel smoothing."""
 CLOSED_AT = 0.35
-"""s after the open frame, in a generic cardiac cycle."""
+"""Time (s) after the open frame, in a generic cardiac cycle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,36 +49,36 @@ class LeafletsOptions:
     ----------
     anterior, posterior : name, number or file, or list of names and numbers
         Segments, labels or objects of a leaflet (``anterior=2``, ``posterior=[P1,P2,P3]``), or its
-        file. By default SlicerHeart's terminology and the names decide; of two nameless labels the
-        taller leaflet is the anterior one.
+        file. By default SlicerHeart's terminology and the names decide. The taller of two nameless
+        leaflets is the anterior one.
     leaflets : name or number, or list of them
         Both leaflets together.
     open, closed : number, file, or list of two files
-        Frames of a map over time, or layers of a segmentation. The closed frame may be another
-        file, or the files of its anterior and posterior leaflet.
+        Frames of a map over time, or layers of a segmentation. The closed frame may be in another
+        file, or in one file for each leaflet.
     units : str or None
-        Unit of surfaces and of points given here: mm, cm or m. Maps are in mm.
+        Length unit of surfaces and of points given here: mm, cm or m. Maps are in mm.
     tips, tips_closed : tuple of float or None
         Papillary tips, antero-lateral and postero-medial: six numbers, LPS.
     muscles : list of two names or files
-        Papillary muscles in the same order; their shapes give the tips.
+        Papillary muscles in the same order; the tips are derived from their shapes.
     anterior_point : tuple of float or None
-        A point of the anterior annulus, for leaflets that are one label or surface. By default the
+        A point of the anterior annulus, if both leaflets are one label or surface. By default the
         anterior leaflet is the taller one. The commissures are where the leaflets are shortest.
     pressure_mmHg : float or None
         Transmitral pressure on the closed valve.
     thickness_mm : tuple of float or None
-        Thickness of the anterior and the posterior leaflet, instead of that between the walls.
+        Thickness of the anterior and posterior leaflets; replaces the distance between walls.
     thickness_range_mm : tuple of float or None
-        Smallest and largest thickness; others are clipped.
+        Smallest and largest thickness; values outside are clipped.
     edge_mm : float
         Edge length of the triangles of the case.
     smoothing_mm : float
-        Standard deviation of the smoothing of the midsurface round the valve.
+        Standard deviation of the midsurface smoothing around the valve.
     observer_mm : float
         Standard deviation of the drawn walls; 0 for a voxelised model.
     mirrored : bool
-        Accept a valve that is its own mirror image.
+        Accept a mirrored valve.
     """
 
     anterior: Any = None
@@ -106,7 +106,7 @@ class LeafletsOptions:
         check_options(self, counts | pairs, limits)
 
     def words(self, name: str) -> tuple[str, ...]:
-        """Names, numbers or files of an option that is one or a list of them."""
+        """Names, numbers or files of an option, which may be a single one or a list."""
         given = getattr(self, name)
         many = given if isinstance(given, list | tuple) else [] if given is None else [given]
         return tuple(map(str, many))
@@ -114,7 +114,7 @@ class LeafletsOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """A frame: its role, its file or the files of both leaflets, and its number there."""
+    """A frame: its role, its file or the files of both leaflets, and its index there."""
 
     role: Role
     files: tuple[Path, ...]
@@ -123,21 +123,21 @@ class _Seen:
 
 
 def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
-    """Make a case of the leaflets of an open valve, or of an open and a closed one.
+    """Make a case from the leaflets of an open valve, or of an open and a closed valve.
 
     Parameters
     ----------
     source : Path
-        Label map (NRRD, ``.seg.nrrd``, NIfTI, MetaImage; LPS as the file states it) or closed
-        surfaces (STL, PLY, OBJ, GLB, VTK). For a file whose name has ``anterior``, the other
-        leaflet is the file with ``posterior`` in its place, and vice versa.
+        Label map (NRRD, ``.seg.nrrd``, NIfTI, MetaImage; converted to LPS) or closed surfaces (STL,
+        PLY, OBJ, GLB, VTK). If the file name contains ``anterior``, the other leaflet is read from
+        the same name with ``posterior``, and vice versa.
     options : LeafletsOptions
 
     Raises
     ------
     InputError, GeometryError
-        An option is missing (named in the message); leaflets are not recognised, have holes, are in
-        pieces, open, apart, or without an orifice.
+        A required option is missing (the message names it); leaflets are not recognised, have
+        holes, are in pieces, not closed surfaces, apart, or without an orifice.
     """
     derived: list[str] = []
     frames: list[FoundFrame] = []
@@ -189,7 +189,7 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
         f"correlated over {correlated:g} mm"
     )
     document = {
-        "name": "segmented valve",  # file names may be names of patients
+        "name": "segmented valve",  # file names may contain patients' names
         "thickness": {"point_data": "thickness"},
         "observation": {"std_mm": std, "correlation_length_mm": correlated},
         "derived": derived,
@@ -206,13 +206,13 @@ def _read(files: tuple[Path, ...]) -> tuple[Content, ...]:
 
 
 def _paired(source: Path) -> tuple[Path, ...]:
-    """A file, or those of the anterior and the posterior leaflet next to each other."""
+    """A file, or the anterior and posterior files of one folder."""
     pair = [source.with_name(re.sub("|".join(REGIONS), name, source.name)) for name in REGIONS]
     return tuple(pair) if pair[0] != pair[1] and all(p.is_file() for p in pair) else (source,)
 
 
 def _scale(content: Content, options: LeafletsOptions) -> float:
-    """Millimetres per unit of a source and of points in the options."""
+    """Millimetres per length unit of a source and of points in the options."""
     if isinstance(content, LabelMap) and options.units not in (None, "mm"):
         raise InputError(f"units={options.units}, but a label map is in mm")
     if not isinstance(content, LabelMap) and options.units not in MM_PER:
@@ -221,7 +221,7 @@ def _scale(content: Content, options: LeafletsOptions) -> float:
 
 
 def _frames(source: Path, options: LeafletsOptions, derived: list[str]) -> list[_Seen]:
-    """The open frame, and the closed one if there is one."""
+    """The open frame, and the closed frame if there is one."""
     anterior, posterior, closed = map(options.words, (*REGIONS, "closed"))
     if len(posterior) == 1 and Path(*posterior).is_file():
         files: tuple[Path, ...] = (Path(*anterior) if anterior else source, Path(*posterior))
@@ -263,7 +263,7 @@ def _frames(source: Path, options: LeafletsOptions, derived: list[str]) -> list[
 def _tips(
     seen: _Seen, tissue: Tissue, options: LeafletsOptions, scale: float, derived: list[str]
 ) -> FloatArray:
-    """Papillary tips ``(2, 3)`` mm from the muscles."""
+    """Papillary tips ``(2, 3)`` mm, derived from the muscles."""
     if options.muscles is None:
         raise InputError("no papillary tips; give tips=[x,y,z,x,y,z] in LPS, or muscles=[...]")
     derived.append(
@@ -279,7 +279,7 @@ def _tips(
 
 
 def _posterior_first(surface: Midsurface, nameless: Sequence[str], derived: list[str]) -> bool:
-    """Whether the second of two leaflets is the taller and so the anterior one."""
+    """Whether the second leaflet is taller and therefore the anterior one."""
     heights = surface.heights
     sizes = f"{heights.max():.1f} mm tall, the other {heights.min():.1f} mm"
     if heights.max() < TALLER * heights.min():
@@ -295,7 +295,7 @@ def _posterior_first(surface: Midsurface, nameless: Sequence[str], derived: list
 
 
 def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) -> Midsurface:
-    """The surface with the stated thickness, and within the stated limits."""
+    """The surface with the stated thickness, clipped to the stated limits."""
     thickness = surface.thickness
     if options.thickness_mm is not None:
         of_vertex = np.ones(len(thickness), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""SlicerHeart: leaflets, annulus, landmarks and papillary muscles of its export modules."""
+"""Imports SlicerHeart exports: leaflets, annulus, landmarks and papillary muscles."""
 
 from __future__ import annotations
 
@@ -27,46 +27,46 @@ from mvest.reading.text import named
 from mvest.typing import FloatArray
 
 OPEN, CLOSED = ("MD", "ED", "CD"), ("MS", "ES", "CS")
-"""Phases in the order of preference."""
+"""Phases in order of preference."""
 TIMES = {"MS": 0.3, "CS": 0.4, "ES": 0.5}
-"""s after the open phase, in the order of a cardiac cycle."""
+"""Times (s) after the open phase, in cardiac order."""
 GENERIC_PRESSURE = 110.0
-"""mmHg on the closed valve: ventricle less atrium from mid to end of systole."""
+"""mmHg on the closed valve: ventricular minus atrial pressure, mid to end of systole."""
 CORRELATED_MM = 10.0
-"""Correlation length along the leaflets of errors of a segmentation."""
+"""Correlation length of segmentation errors along the leaflets."""
 MAX_RMS = 4.0
-"""Largest rms distance (mm) of the annulus from the edges of the leaflets."""
+"""Largest RMS distance (mm) between the annulus and the leaflet edges."""
 
 _Seen: TypeAlias = tuple[SeenPhase, Role]
 
 
 @dataclass(frozen=True, slots=True)
 class SlicerheartOptions:
-    """Values that a folder of SlicerHeart does not state.
+    """Values that a SlicerHeart folder does not state.
 
     Attributes
     ----------
     scene : str or None
-        Which scene to take, if the folder holds several.
+        Scene to import, if the folder holds several.
     only : str or None
-        Word in the names of surfaces, if there are several of one leaflet.
+        Word in file names that selects one of several surfaces of a leaflet.
     open, closed : str or None
-        Phase (MD, ED, MS, ES, ...) of the reference and of the closed frame; by default the first
-        of MD, ED, CD and of MS, ES, CS. If file names have no phases, ``closed`` is the folder of
-        the closed valve.
+        Phases (MD, ED, MS, ES, ...) of the reference and of the closed frame; by default the first
+        available of MD, ED, CD and of MS, ES, CS. If file names have no phases, ``closed`` is the
+        folder of the closed valve.
     tips : tuple of float or None
         Papillary tips of the reference, antero-lateral and postero-medial: six numbers, LPS mm.
     pressure_mmHg : float or None
         Transmitral pressure on the closed valve; 110 mmHg by default.
     thickness_mm : tuple of float or None
-        Of the anterior and the posterior leaflet; generic by default.
+        Thickness of the anterior and posterior leaflets; generic by default.
     midsurface : bool
-        Whether the surfaces are midsurfaces. By default they are atrial sides, and are moved
+        Whether the surfaces are midsurfaces. By default they are atrial sides, which are moved
         towards the ventricle by half the thickness.
     std_mm : float or None
         Standard deviation of a coordinate of the surfaces; 1 mm by default.
     mirrored : bool
-        Accept a valve that is its own mirror image.
+        Accept a mirrored valve.
     """
 
     scene: str | None = None
@@ -85,15 +85,15 @@ class SlicerheartOptions:
 
     @property
     def thickness(self) -> tuple[float, ...]:
-        """Of the anterior and the posterior leaflet (mm), stated or generic."""
+        """Thickness (mm) of the anterior and posterior leaflets, stated or generic."""
         return self.thickness_mm or tuple(GENERIC_THICKNESS[name] for name in REGIONS)
 
 
 def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
-    """A case of a folder that SlicerHeart's ValveBatchExport or ValveFemExport wrote.
+    """Make a case from a folder written by SlicerHeart's ValveBatchExport or ValveFemExport.
 
-    An open phase becomes the reference, a closed one the closed frame, a further closed one is held
-    out. The leaflets are separate surfaces there, and are joined along the commissures.
+    An open phase becomes the reference and a closed phase the closed frame; another closed phase is
+    held out. The leaflets are separate surfaces in the export; they are joined at the commissures.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     Raises
     ------
     InputError, GeometryError
-        An option is missing (named in the message), files are damaged or contradict each other.
+        A required option is missing (the message names it), or files are damaged or contradictory.
     """
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; expected one that SlicerHeart wrote")
@@ -115,7 +115,7 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
         frames = _frames(_chosen(source, options, derived), options, derived)
         std, known = options.std_mm, {"correlation_length_mm": CORRELATED_MM}
         document = {
-            "name": "valve from SlicerHeart",  # names of files and scenes may be those of patients
+            "name": "valve from SlicerHeart",  # names of files and scenes may identify patients
             "source": "SlicerHeart",
             "thickness": dict(zip(REGIONS, map(float, options.thickness), strict=True)),
             **({} if std is None else {"observation": {"std_mm": std, **known}}),
@@ -125,7 +125,7 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
 
 
 def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> list[_Seen]:
-    """The phases to import, in the order of time."""
+    """The phases to import, in time order."""
     by_phase = read_folder(source, options.scene, options.only)
     closed = options.closed
     if closed is not None and Path(closed).is_dir():
@@ -156,7 +156,7 @@ def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> li
 def _frames(
     chosen: Sequence[_Seen], options: SlicerheartOptions, derived: list[str]
 ) -> list[FoundFrame]:
-    """The frames with joined leaflets, in the order of time."""
+    """The frames with joined leaflets, in time order."""
     frames: list[FoundFrame] = []
     pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
     offset, seams = (0.0, 0.0), None
@@ -177,7 +177,7 @@ def _frames(
         with named(label):
             tips = _tips_of(seen, role, options, frames, notes)
             leaflets, commissures, down = _placed(seen, tips, options.mirrored, notes)
-            # The closed edges touch all along: they are joined as far as the open ones.
+            # Closed edges touch all along, so they are joined as far as the open ones.
             surface, seams, gap = joined(
                 leaflets,
                 commissures,
@@ -234,7 +234,7 @@ def _placed(
 ) -> tuple[list[Leaflet], FloatArray, FloatArray]:
     """Leaflets, commissures ``(2, 3)`` mm, and the direction ``(3,)`` to the ventricle.
 
-    The annulus must lie at the leaflets, and landmarks must not be mirrored.
+    The annulus must be close to the leaflets, and landmarks must not be mirrored.
     """
     leaflets, marks = [], seen.landmarks
     for name, (vertices, triangles) in zip(REGIONS, seen.leaflets, strict=True):

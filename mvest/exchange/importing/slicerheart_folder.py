@@ -1,11 +1,11 @@
-"""Folders of SlicerHeart: the words in a file's name identify its content.
+"""SlicerHeart folders: the words in a file's name identify its content.
 
 ValveBatchExport begins every name with ``SCENE_VALVE_frame_N_PHASE`` (``ValveBatchExportRules/
 base.py``). The rest has changed: leaflet surfaces were ``mitral_anterior_leaflet`` in April 2026,
-and ``atrial_mitral_anterior_leaflet`` from August 2026, when the former became the name of closed
+and ``atrial_mitral_anterior_leaflet`` from August 2026, when the old name was given to closed
 surfaces of segments. ValveFemExport, and models saved by hand, name neither scene nor phase. Models
-have the axes that they name (``SPACE=LPS``), or RAS as before Slicer 4.11; tables have R, A, S of
-the same origin. Here everything is LPS in mm.
+use the axes that they name (``SPACE=LPS``), or RAS as before Slicer 4.11. Tables use RAS with the
+same origin. Here everything is LPS in mm.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ PHASES = {
     "UN": "unknown",
     **{f"P{k}": f"custom{k}" for k in range(1, 5)},
 }
-"""Phases by their abbreviations in file names and tables (``HeartValveLib/Constants.py``)."""
+"""Phases, by their abbreviation in file names and tables (``HeartValveLib/Constants.py``)."""
 _NAME = re.compile(
     r"(?P<scene>.+?)_(?P<valve>mitral|tricuspid|aortic|pulmonary|cavc|lavv|unknown|\S+ \w+ valve)"
     rf"(?:_frame_(?P<frame>\d{{1,6}}))?_(?P<phase>{'|'.join(PHASES)})(?:_(?P<again>\d+))?"
     r"(?:_(?P<rest>.+))?"
 )
 _PHASE = re.compile(r"(?:.*[^A-Za-z0-9])?(?P<phase>[MEC][DS])(?:[^A-Za-z0-9].*)?")
-"""In other names, where CT is a modality and P1 a scallop."""
+"""Phases in other names, where CT is a modality and P1 a scallop."""
 LEAFLETS = {"anterior": {"anterior", "aml", "amvl"}, "posterior": {"posterior", "pml", "pmvl"}}
 MUSCLES = (
     ({"antero", "lateral"}, {"anterolateral"}, {"al"}),
     ({"postero", "medial"}, {"posteromedial"}, {"pm"}),
 )
-"""Words of the papillary muscles, in the order of the tips of a case."""
+"""Words for the papillary muscles, in the order of a case's tips."""
 PAPILLARY = {"papillary", "muscle", "muscles", "tip", "tips"}
 ANNULUS, MARKS = {"annulus"}, {"landmarks", "labels"}
 NO_LEAFLET = PAPILLARY | ANNULUS | {"ventricular", "chords", "chordae"}
@@ -60,12 +60,12 @@ _TABLES = {
     "ValveLandmarkPoints.csv": ("LandmarkLabel", [f"Landmark{k}" for k in "RAS"]),
 }
 MIN_CONTOUR = 8
-"""Points of an annulus."""
+"""Smallest number of annulus points."""
 MAX_FILES = 20_000
 
 
 def words_of(name: str) -> set[str]:
-    """Lower-case words of a name, also of one like ``AnnulusContour``."""
+    """Lower-case words of a name, also in camel case (``AnnulusContour``)."""
     return {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)}
 
 
@@ -85,7 +85,7 @@ class _File:
         self.leaflet = "" if len(named) != 1 or self.words & NO_LEAFLET else named[0]
 
     def fits(self, other: _File) -> bool:
-        """Whether its name contradicts neither scene, frame nor phase of a surface."""
+        """Whether its name agrees with the scene, frame and phase of a surface."""
         pairs = ((self.scene, other.scene), (self.frame, other.frame))
         named = self.valve.lower() in ("", "mitral") and self.phase in ("", other.phase)
         return named and all(a == b or not a or not b for a, b in pairs)
@@ -93,7 +93,7 @@ class _File:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPhase:
-    """One valve in one phase; ``notes`` are assumptions and data that were not used."""
+    """One valve in one phase; ``notes`` lists assumptions and unused data."""
 
     phase: str  # key of `PHASES`; empty if the export names none
     leaflets: tuple[tuple[FloatArray, IntArray], ...]  # anterior, posterior: (n, 3) mm, (m, 3)
@@ -106,16 +106,16 @@ class SeenPhase:
 def read_folder(
     folder: Path, scene: str | None = None, only: str | None = None
 ) -> dict[str, SeenPhase]:
-    """All phases of the mitral valve of one scene, by their abbreviations or an empty name.
+    """All phases of one scene's mitral valve, by abbreviation or an empty name.
 
-    ``scene`` is the name of one of several scenes, ``only`` a word in the names of surfaces if
-    there are several of a leaflet.
+    ``scene`` selects one of several scenes; ``only`` is a word in file names that selects one of
+    several surfaces of a leaflet.
 
     Raises
     ------
     InputError, GeometryError
-        There are no mitral leaflets, several scenes, or several surfaces of a leaflet; a file is
-        damaged.
+        There are no mitral leaflets, several scenes, or several surfaces of one leaflet, or a file
+        is damaged.
     """
     paths = sorted(islice(folder.rglob("*"), MAX_FILES + 1))
     if len(paths) > MAX_FILES:
@@ -152,7 +152,7 @@ def read_folder(
 
 
 def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> SeenPhase:
-    """The phase of some surfaces of leaflets."""
+    """Read one phase from its leaflet surfaces."""
     notes: list[str] = []
     this = min(mine, key=lambda f: int(f.frame or -1))
     if len(frames := sorted({f.frame for f in mine})) > 1:
@@ -204,7 +204,7 @@ def _leaflet(
     fitting = [f for f in files if f.leaflet == name]
     for better in ("atrial", "fit"):
         fitting = [f for f in fitting if better in f.words] or fitting
-    # Further valve models of a frame have a number behind the phase.
+    # Further valve models of a frame have a number after the phase.
     fitting = [f for f in fitting if not f.again] or fitting
     if len(fitting) != 1:
         listed = one_line(", ".join(f.path.name for f in fitting or files), 150)
@@ -219,7 +219,7 @@ def _leaflet(
 
 
 def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:
-    """Labels and positions ``(r, 3)`` mm of one frame, from the first place that has the table."""
+    """Labels and positions ``(r, 3)`` mm of one frame, from the first folder with the table."""
     label, position = _TABLES[name]
     file = next((place / name for place in places if (place / name).is_file()), None)
     if file is None:
@@ -237,15 +237,15 @@ def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], F
 
 
 def _muscle(words: set[str]) -> int | None:
-    """Which papillary muscle some words name, if any."""
+    """Index of the papillary muscle that the words name, if any."""
     found = [k for k, names in enumerate(MUSCLES) if any(name <= words for name in names)]
     return found[0] if len(found) == 1 else None
 
 
 def _tips_in(file: Path, words: set[str], item: PointList) -> dict[int, FloatArray]:
-    """Tips by muscle, from the list of one muscle or from points labelled with their muscles.
+    """Tips by muscle, from the list of one muscle or from points labelled by muscle.
 
-    The list of one has base, tip and insertion (``PAPILLARY_MUSCLE_POINT_LABELS``).
+    The list of one muscle has base, tip and insertion (``PAPILLARY_MUSCLE_POINT_LABELS``).
     """
     muscle = _muscle(words)
     if muscle is None:

@@ -1,6 +1,6 @@
-"""Shared by all importers: checks of options, sides and frames, and the case itself.
+"""Shared by all importers: checks options, sides and frames, and makes the case.
 
-A case is written as a folder and read by the usual rules.
+A case is written to a folder and read back with the usual checks.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ REGIONS = ("anterior", "posterior")
 def check_options(
     options: object, counts: Mapping[str, int], limits: Mapping[str, tuple[float, float]]
 ) -> None:
-    """Check the lengths of options that are lists, and the limits of numbers.
+    """Check the lengths of list options and the limits of numbers.
 
     Raises
     ------
     InputError
-        Another length, a number that is not finite, or a value beyond its limits.
+        A list has the wrong length, or a number is not finite or beyond its limits.
     """
     for name, count in counts.items():
         given = getattr(options, name)
@@ -49,10 +49,10 @@ def check_options(
 
 
 def check_sides(left: str, to_left: FloatArray, to_front: FloatArray, down: FloatArray) -> None:
-    """Refuse a valve that is its own mirror image, by an InputError.
+    """Raise an InputError if a valve is mirrored.
 
-    ``left`` names what must lie on the left of the anterior leaflet, seen from the atrium. The
-    directions ``(3,)`` point to it, to the anterior leaflet, and to the ventricle.
+    ``left`` names the structure that must be left of the anterior leaflet, seen from the atrium.
+    The directions ``(3,)`` point to it, to the anterior leaflet, and to the ventricle.
     """
     if np.linalg.det(np.stack([to_left, to_front, down])) < 0:
         raise InputError(
@@ -64,7 +64,7 @@ def check_sides(left: str, to_left: FloatArray, to_front: FloatArray, down: Floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundFrame:
-    """A frame in mm, mmHg and s; for its fields see ``frames`` of a case."""
+    """A frame in mm, mmHg and s; for the fields see ``frames`` of a case."""
 
     name: str
     role: Role
@@ -81,15 +81,15 @@ def case_of_frames(
     *,
     mirrored: bool,
 ) -> ValveCase:
-    """The case of frames without common vertices, with the checks of every case.
+    """Make a case from frames without common vertices, with the usual checks.
 
     The regions of the frames are 0 (anterior) and 1 (posterior). ``document`` has further fields of
-    ``case.yaml``; ``mirrored`` accepts a valve that is its own mirror image.
+    ``case.yaml``; ``mirrored`` accepts a mirrored valve.
 
     Raises
     ------
     InputError, GeometryError
-        As `mvest.cases.folder.read_case`; the valve is mirrored, or the frames are exchanged.
+        As `mvest.cases.folder.read_case`; or the valve is mirrored, or the frames are swapped.
     """
     for one in frames:
         x, faces, region = one.surface.vertices, one.surface.triangles, one.surface.region

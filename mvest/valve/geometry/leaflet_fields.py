@@ -1,9 +1,9 @@
-"""Two thick leaflets on a grid, as signed distances, and their common closed surface.
+"""Represents two thick leaflets as signed distances on a grid; makes their closed surface.
 
-Where two leaflets meet they are either one piece of tissue (at a commissure) or only in contact,
-and a segmentation does not tell which. In an open valve they meet at the commissures alone, and how
-far down from the annulus they do is a length that does not change. So the leaflets of a closed
-valve are cut apart wherever they meet farther from the annulus, or deeper than their thickness.
+Where two leaflets meet they are either one piece of tissue (at a commissure) or only in contact; a
+segmentation does not distinguish the two. In an open valve they meet only at the commissures, down
+to a distance from the annulus that does not change. So the leaflets of a closed valve are cut apart
+wherever they meet farther from the annulus, or deeper than their thickness.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import euler_number, surface_edges
 
-# skimage states no types.
+# skimage has no type hints.
 marching_cubes: Any = measure.marching_cubes
 MARGIN_MM = 3.0
 STEP_MM = 0.4
 """Grid step (mm) for open leaflets."""
 CLOSED_STEP_MM = 0.2
-"""Grid step (mm) if leaflets are cut apart: a cut must leave most of a leaflet 1 mm thick."""
+"""Grid step (mm) if leaflets are cut apart: the cut must leave most of a 1 mm leaflet intact."""
 CUT_STEPS = 2.0
-"""Width of the cut between leaflets in contact, in grid steps. It stays open: a free wall loses as
-much by smoothing, so the middle stays where it is."""
+"""Width of the cut between leaflets in contact, in grid steps. The cut is not refilled: smoothing
+removes as much from a free wall, so the midsurface does not move."""
 SEAM_REACH_MM = 2.0
-"""Distance (mm) from the seam up to which leaflets are one piece."""
+"""Leaflets are one piece within this distance (mm) of the seam."""
 SEAM_THICKNESSES = 2.5
-"""Largest width of a seam over the thickness; beyond it leaflets are in contact. The thickness is
-estimated from the mean distance, which rims and voxels make a quarter too small; too narrow a seam
-leaves holes."""
+"""Largest seam width relative to the thickness; beyond it leaflets are in contact. The thickness is
+estimated from the mean distance, which rims and voxels reduce by a quarter. A seam that is too
+narrow leaves holes."""
 LAYER_MM = 0.5
-"""Depth (mm) of the layers below the annulus in which the outermost point of a seam is found."""
+"""Depth (mm) of the layers below the annulus in which a seam's outermost point is searched."""
 LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4)
-"""Offsets of the walls, in voxels, that are tried until the orifice is the only hole."""
+"""Wall offsets (voxels), tried in order until the orifice is the only hole."""
 ON_GRID = 0.02
-"""Least distance of a grid point from the surface, in steps."""
+"""Smallest distance of a grid point from the surface, in steps."""
 MAX_VOXELS = 4 * 10**7
 
 
@@ -55,8 +55,8 @@ MAX_VOXELS = 4 * 10**7
 class LeafletFields:
     """Signed distances to the leaflets, positive inside, on a grid."""
 
-    #: (2, I, J, K) or (1, I, J, K) mm, to the anterior and to the posterior leaflet, or to both if
-    #: they share one label
+    #: (2, I, J, K) mm, to the anterior and posterior leaflets, or (1, I, J, K) mm, to both if they
+    #: share one label
     distance: FloatArray
     union: FloatArray  #: (I, J, K) mm, to both leaflets together
     step: float  #: mm between grid points
@@ -64,7 +64,7 @@ class LeafletFields:
     voxel_mm: float  #: size of the original voxels, 0 for surfaces
 
     def label(self, points: FloatArray) -> IntArray:
-        """The nearer leaflet ``(k,)``, 0 anterior and 1 posterior, of points ``(k, 3)``.
+        """The nearest leaflet ``(k,)``, 0 anterior or 1 posterior, to points ``(k, 3)``.
 
         Points are in mm from the first grid point.
         """
@@ -88,18 +88,18 @@ class LeafletFields:
 
 
 class ThickLeaflets(NamedTuple):
-    """The closed surface of two leaflets, cut apart in contact.
+    """The closed surface of two leaflets, cut apart where they are in contact.
 
     Attributes
     ----------
     vertices, triangles
         ``(n, 3)`` mm from the first point of the grid, and ``(m, 3)``.
     seams : (2,) mm
-        Length down from the annulus over which the leaflets are one piece, on the side of each tip.
+        Length from the annulus down over which the leaflets are one piece, on the side of each tip.
     grown_mm : float
-        Outward offset of all walls that was needed to close holes.
+        Outward offset of all walls needed to close holes.
     derived : tuple of str
-        Changes that were needed for one closed surface.
+        Changes needed to get one closed surface.
     """
 
     vertices: FloatArray
@@ -115,12 +115,12 @@ def fields_of_masks(
     blur: float,
     step_mm: float = STEP_MM,
 ) -> tuple[LeafletFields, FloatArray]:
-    """Signed distances to sets of voxels.
+    """Compute signed distances to sets of voxels.
 
     Parameters
     ----------
     masks
-        ``(I, J, K)`` each: voxels of the anterior and of the posterior leaflet, or of both.
+        ``(I, J, K)`` each: voxels of the anterior and posterior leaflets, or of both together.
     spacing : (3,) mm
     blur
         Standard deviation of the smoothing, in voxels.
@@ -132,12 +132,12 @@ def fields_of_masks(
     LeafletFields
         On a finer grid around the leaflets.
     ndarray
-        ``(3,)`` position of its first point, in voxels.
+        ``(3,)`` position of the grid's first point, in voxels.
 
     Raises
     ------
     GeometryError
-        A leaflet without voxels, or leaflets too large for the grid.
+        A leaflet has no voxels, or the leaflets are too large for the grid.
     """
     if not all(mask.any() for mask in masks):
         raise GeometryError("no voxel of a leaflet")
@@ -163,7 +163,7 @@ def fields_of_masks(
         part[inside] = mask[box]
         inner = ndimage.distance_transform_edt(part, sampling=spacing)
         outer = ndimage.distance_transform_edt(~part, sampling=spacing)
-        # The wall of a voxel is half a voxel nearer than the next centre.
+        # A voxel's wall is half a voxel nearer than the next centre.
         signed = np.where(part, inner - 0.5 * voxel, 0.5 * voxel - outer)
         fine = ndimage.map_coordinates(signed, at, order=1, mode="nearest")
         return np.asarray(ndimage.gaussian_filter(fine, blur * voxel / step))
@@ -181,9 +181,9 @@ def fields_of_masks(
 def inside_surfaces(
     surfaces: Sequence[tuple[FloatArray, IntArray]], step_mm: float
 ) -> tuple[list[BoolArray], FloatArray]:
-    """Which points of a common grid lie inside each of several closed surfaces.
+    """Find the points of a common grid inside each of several closed surfaces.
 
-    Near a surface its normal at the closest point decides; holes are then filled.
+    Near a surface, the normal at the closest point decides; holes are then filled.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ def inside_surfaces(
 def thick_leaflets(
     fields: LeafletFields, tips: FloatArray, seams: FloatArray | None = None
 ) -> ThickLeaflets:
-    """The closed surface of both leaflets: one piece at the commissures, cut apart in contact.
+    """Make the closed surface of both leaflets: joined at the commissures, cut apart in contact.
 
     Parameters
     ----------
@@ -292,8 +292,8 @@ def _joined(
     """Grid points where the leaflets are one piece, and the lengths of both seams.
 
     A seam starts where the leaflets meet farthest up and out on the side of its papillary tip, and
-    follows the outermost meeting points. Leaflets that meet farther in, as folds next to a
-    commissure do, are in contact. If nothing is in contact, all grid points are returned.
+    follows the outermost meeting points. Leaflets that meet farther in, such as folds next to a
+    commissure, are in contact. If nothing is in contact, all grid points are returned.
     """
     where = np.argwhere(meet) * fields.step
     tissue = np.argwhere(fields.union > 0).mean(axis=0) * fields.step
@@ -302,7 +302,7 @@ def _joined(
     side = tips[0] - tips[1]
     side -= (side @ up) * up
     side /= np.linalg.norm(side)
-    # Distances in a sheet are a quarter of its thickness on average.
+    # The mean distance within a sheet is a quarter of its thickness.
     thickness = fields.true_thickness(4 * fields.distance[fields.distance > 0].mean())
     width = SEAM_THICKNESSES * float(thickness)
     apart = np.full(len(where), seams is not None)
@@ -330,7 +330,7 @@ def _joined(
 
 
 def _behind_outermost(depth: FloatArray, outward: FloatArray) -> FloatArray:
-    """Distance ``(k,)`` mm of points behind the outermost one of about the same depth."""
+    """Distance ``(k,)`` mm of points inward from the outermost point at similar depth."""
     layer = np.floor((depth - depth.min()) / LAYER_MM).astype(np.int64)
     farthest = np.full(layer.max() + 1, -np.inf)
     np.maximum.at(farthest, layer, outward)
@@ -338,7 +338,7 @@ def _behind_outermost(depth: FloatArray, outward: FloatArray) -> FloatArray:
 
 
 def _largest(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray, int]:
-    """The largest connected piece, and the number of the others."""
+    """The largest connected piece, and the number of other pieces."""
     edges = surface_edges(triangles)
     n = len(vertices)
     graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))

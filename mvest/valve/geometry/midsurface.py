@@ -1,10 +1,10 @@
-"""The midsurface of thick leaflets: from a closed surface to a band with a thickness.
+"""Computes the midsurface of thick leaflets: from a closed surface to a band with a thickness.
 
 The two walls of the closed surface (`mvest.valve.geometry.walls`) are bands with common edges.
-Points of both walls with equal harmonic coordinates face each other, and the middles of such pairs
-form a first midsurface. It is then moved to where both walls are equally far away: the medial sheet
-of the tissue. Along the edges, where the nearest wall is the rim, the thickness is taken from the
-tissue next to it.
+Points of both walls with equal harmonic coordinates face each other, and the midpoints of such
+pairs form a first midsurface. It is then moved until it is equally far from both walls: the medial
+sheet of the tissue. Near the edges, where the nearest wall is the rim, the thickness is taken from
+the tissue farther in.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from mvest.valve.geometry.walls import Wall, closed_band, walls
 EDGE_MM = 1.2
 """Mean edge length of the triangles, mm."""
 ROUNDS = 8
-"""Iterations of centring the sheet and spreading its vertices."""
+"""Rounds of centring the sheet and redistributing its vertices."""
 MAX_STEP = 0.5
 """Largest centring step, mm."""
 RIM_SHARE = 0.8
-"""Distance from an edge, over the thickness, within which the nearest wall is the rim."""
+"""Distance from an edge, relative to the thickness, within which the nearest wall is the rim."""
 FINE = 200
-"""Samples of a line from annulus to free edge before its vertices are spread."""
+"""Samples of a line from annulus to free edge before its vertices are redistributed."""
 TIP_CONE = 60.0
-"""Degrees around the direction of a papillary tip within which its commissure lies."""
+"""Largest angle (degrees) between a papillary tip and its commissure, around the valve."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class Midsurface:
     ----------
     vertices : (n, 3) mm
         A grid: vertex ``j * columns + i`` is column i, row j. The first row is the annulus, the
-        last one the free edge; the commissures are columns 0 and ``columns / 2``.
+        last the free edge; the commissures are columns 0 and ``columns / 2``.
     triangles : (m, 3)
         Facing the ventricle.
     region : (m,)
@@ -60,7 +60,7 @@ class Midsurface:
     annulus, free_edge : (columns,)
         Vertices in loop order.
     derived : tuple of str
-        Properties that were not given and follow from the shape.
+        Properties that were not given but derived from the shape.
     """
 
     vertices: FloatArray
@@ -73,7 +73,7 @@ class Midsurface:
 
     @property
     def commissures(self) -> IntArray:
-        """Vertices ``(2, 2)``: for each commissure those on the annulus and on the free edge."""
+        """Vertices ``(2, 2)``: for each commissure, one on the annulus and one on the free edge."""
         columns = len(self.annulus)
         return np.column_stack([self.annulus, self.free_edge])[[0, columns // 2]]
 
@@ -84,7 +84,7 @@ class Midsurface:
         return np.asarray(_arc_lengths(grid)[-1].reshape(2, -1).max(axis=1))
 
     def exchanged(self) -> Midsurface:
-        """The same with anterior and posterior leaflet exchanged."""
+        """The same surface with anterior and posterior leaflets swapped."""
         columns = len(self.annulus)
 
         def turned(values: FloatArray) -> FloatArray:
@@ -94,7 +94,7 @@ class Midsurface:
         return replace(self, vertices=turned(self.vertices), thickness=turned(self.thickness))
 
     def smoothed(self, width_mm: float) -> tuple[Midsurface, float]:
-        """The same smoothed around the valve, and the largest move (mm) of a vertex.
+        """Smooth the surface around the valve; also return the largest move (mm) of a vertex.
 
         The Gaussian weights have the standard deviation `width_mm` along the annulus, and
         proportionally less on shorter lines such as the free edge.
@@ -116,29 +116,29 @@ def midsurface(
     label: Callable[[FloatArray], IntArray] | None = None,
     edge_mm: float = EDGE_MM,
 ) -> Midsurface:
-    """The midsurface of two thick leaflets around one orifice.
+    """Compute the midsurface of two thick leaflets around one orifice.
 
     Parameters
     ----------
     vertices, triangles
         ``(n, 3)`` mm and ``(m, 3)``.
     tips
-        ``(2, 3)`` mm, papillary tips. The free edge is the loop nearer to them, and each commissure
-        lies where the leaflets are shortest on the side of a tip.
+        ``(2, 3)`` mm, papillary tips. The free edge is the loop nearer to them. Each commissure is
+        where the leaflets are shortest on the side of a tip.
     commissures
         ``(2, 3)`` mm, if known.
     anterior
         ``(3,)`` mm, a point near the anterior annulus, if known. Otherwise the anterior leaflet is
         the taller one.
     label
-        Leaflet (0 anterior, 1 posterior) of points ``(k, 3)``, if known; then nothing is derived.
+        Returns the leaflet (0 anterior, 1 posterior) of points ``(k, 3)``, if known.
     edge_mm
         Mean edge length of the triangles.
 
     Raises
     ------
     GeometryError
-        The surface is no closed thin band, or the leaflets cannot be distinguished.
+        The surface is not a closed thin band, or the leaflets cannot be distinguished.
     """
     first, second = walls(*closed_band(vertices, triangles))
     derived: list[str] = []
@@ -196,7 +196,7 @@ class _PairedWalls:
             self._coordinates.append(
                 surface_coordinates(wall.vertices, wall.triangles, around, edge)
             )
-        # For each wall, at each end, (2, k): the common angle and the wall's own.
+        # For each wall, at each end, (2, k): common angle and wall's own angle.
         self._tables: list[list[FloatArray]] = [[], []]
         beginning = 0.0
         for end in (annulus, 1 - annulus):
@@ -214,14 +214,14 @@ class _PairedWalls:
             self._tables[1].append(np.stack([common, own[1] + turns]))
 
     def middle(self, angle: FloatArray, s: FloatArray) -> FloatArray:
-        """Middles ``(..., 3)`` mm of the pairs of points at common angles and s ``(...)``."""
+        """Midpoints ``(..., 3)`` mm of the pairs of points at common angles and s ``(...)``."""
         angle, s = np.broadcast_arrays(angle, s)
         points = []
         for wall, coordinates, tables in zip(
             self._walls, self._coordinates, self._tables, strict=True
         ):
             ends = [_periodic(angle, *table) for table in tables]
-            # Of the second end that turn which is nearer to the first.
+            # Shift the second end's angle by the turn nearest to the first's.
             ends[1] = ends[0] + wrapped(ends[1] - ends[0])
             theta = (1 - s) * ends[0] + s * ends[1]
             triangle, weights = coordinates.locate(np.mod(theta.ravel(), 2 * np.pi), s.ravel())
@@ -246,7 +246,7 @@ def _label_seams(
 ) -> FloatArray:
     """Angles ``(2, 2)`` of the seams, by end and commissure; the first one starts the anterior.
 
-    The anterior label is an arc of each level line; its share and centre give both ends.
+    The anterior label is an arc of each level line; its fraction and centre give both ends.
     """
     front = label(lines.reshape(-1, 3)).reshape(lines.shape[:2]) == 0
     share = front.mean(axis=1)
@@ -279,7 +279,7 @@ def _short_seams(
     anterior: FloatArray | None,
     derived: list[str],
 ) -> FloatArray:
-    """As `_label_seams`, with seams where the leaflets are short."""
+    """As `_label_seams`, but with seams where the leaflets are shortest."""
     annulus = lines[0]
     smooth = gaussian_filter1d(heights, max(1.0, len(angle) / 60), mode="wrap")
     if commissures is not None:
@@ -338,13 +338,13 @@ def _sheet(pair: _PairedWalls, seams: FloatArray, columns: int, rows: int) -> Fl
 
 
 def _arc_lengths(lines: FloatArray) -> FloatArray:
-    """Lengths ``(k, c)`` mm along columns ``(k, c, 3)`` from their beginning."""
+    """Arc lengths ``(k, c)`` mm along columns ``(k, c, 3)``."""
     steps = np.linalg.norm(np.diff(lines, axis=0), axis=2)
     return np.concatenate([np.zeros((1, lines.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def _spread(lines: FloatArray, rows: int) -> FloatArray:
-    """Columns ``(k, c, 3)`` sampled at equal distances ``(rows, c, 3)``."""
+    """Columns ``(k, c, 3)`` resampled at equal arc lengths to ``(rows, c, 3)``."""
     arc = _arc_lengths(lines)
     share = np.linspace(0, 1, rows)
     result = np.empty((rows, lines.shape[1], 3))
@@ -357,9 +357,9 @@ def _spread(lines: FloatArray, rows: int) -> FloatArray:
 
 
 def _centred(sheet: FloatArray, first: Wall, second: Wall) -> FloatArray:
-    """The sheet with all but its edges moved to where both walls are equally far.
+    """Move the sheet, except its edges, to equal distance from both walls.
 
-    One step of Newton's method for the difference of the two distances, along its gradient.
+    One Newton step on the difference of the two distances, along its gradient.
     """
     inner = sheet[1:-1].reshape(-1, 3)
     distances, directions = [], []
@@ -380,7 +380,7 @@ def _centred(sheet: FloatArray, first: Wall, second: Wall) -> FloatArray:
 
 
 def _smoothed(sheet: FloatArray) -> FloatArray:
-    """Interior vertices moved a quarter of the way to the mean of their neighbours."""
+    """Move interior vertices a quarter of the way to the mean of their neighbours."""
     result = sheet.copy()
     around = np.roll(sheet, 1, axis=1) + np.roll(sheet, -1, axis=1)
     mean = 0.25 * (around[1:-1] + sheet[:-2] + sheet[2:])
@@ -389,7 +389,7 @@ def _smoothed(sheet: FloatArray) -> FloatArray:
 
 
 def _thickness(sheet: FloatArray, first: Wall, second: Wall) -> FloatArray:
-    """Sum ``(rows, columns)`` mm of the distances to both walls; near an edge that inside of it."""
+    """Sum ``(rows, columns)`` mm of the distances to both walls; edges get the value farther in."""
     shape = sheet.shape[:2]
     points = sheet.reshape(-1, 3)
     total = sum(

@@ -1,8 +1,8 @@
 """Signed distances to a moving surface and offsets from a moving curve, with their derivatives.
 
-Distances to facets have derivatives that jump at creases and a sign that flips beyond the border.
-Smoothed over a width they have neither problem, so that a filter that uses the derivatives
-converges to its true posterior.
+The derivative of the distance to facets jumps at creases, and its sign flips beyond the border.
+Smoothing over a width removes both problems, so that a filter that uses the derivatives converges
+to its true posterior.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.triangles import area_vectors
 
 TANGENT_REACH = 6.0
-"""Distance to each side over which the direction of a curve is measured, in standard deviations of
-its points: the direction is then known to 1 / (6 sqrt(2)) rad, which loses 1.4 % of the information
+"""Distance to each side over which a curve's direction is measured, in standard deviations of its
+points. The direction is then known to 1 / (6 sqrt(2)) rad, which loses 1.4 % of the information
 across it."""
 
 REACH = 5.5
-"""Distance beyond the nearest triangle, in widths, where weights are cut off (below 3e-7)."""
+"""Distance beyond the nearest triangle, in widths, at which weights (below 3e-7) are cut off."""
 
 
 def smooth_distances(
     points: FloatArray, vertices: FloatArray, triangles: IntArray, width: float
 ) -> tuple[FloatArray, list[csr_array]]:
-    """Signed distances of points to a surface smoothed over a width, and their derivatives.
+    """Signed distances from points to a surface smoothed over a width, and their derivatives.
 
     Triangles with area vectors a and middles p have the weights ``g = exp(-|x - p|² / 2 w²)``::
 
@@ -34,7 +34,7 @@ def smooth_distances(
         dd = sum (g da . y - g a . dp + dg a . y) / |V|,   y = x - p - d u
 
     (implicit moving least squares: Kolluri, ACM Trans. Algorithms 4 (2008) 18). The surface is
-    continued beyond its border as it ends. On a sphere of radius r the distance is off by w²/r.
+    extrapolated beyond its border. On a sphere of radius r the distance error is w²/r.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def smooth_offsets(
     ----------
     curve : (j, 3) mm
     across : (j, 3, 2)
-        Two directions at each point, from `across_curve`.
+        Two directions per point, from `across_curve`.
     loop : (e, 3) mm
         Points along the curve, spaced more closely than the width.
     motion : (e, 3, p)
@@ -121,7 +121,7 @@ def smooth_offsets(
     width : float
         w, mm.
     own : (j, e), optional
-        Points of the curve with which each observed point may be compared.
+        Whether each observed point may be compared with each point of the curve.
 
     Returns
     -------
@@ -154,9 +154,9 @@ def closest_on_loop(
     edge : (j,)
         Edge k runs from vertex k to the next.
     along : (j,)
-        Position along the line of the edge, whose ends are 0 and 1.
+        Position along the edge, from 0 to 1.
     offset : (j, 3) mm
-        From the closest point to the point.
+        Vector from the closest point to the point.
     """
     step = np.roll(loop, -1, axis=0) - loop
     squared = np.maximum(np.einsum("ek,ek->e", step, step), np.finfo(np.float64).tiny)

@@ -1,4 +1,4 @@
-"""Closest points and intersections between points and triangulated surfaces.
+"""Closest points and intersections of points and triangulated surfaces.
 
 Everything here is exact geometry on plain arrays: vertices ``(n, 3)`` in mm and triangles
 ``(m, 3)`` of vertex numbers. The closest point of a triangle follows Ericson, *Real-Time
@@ -20,7 +20,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import directed_edges, surface_edges
 
 SAMPLED_EDGES = 100
-"""Number of edges from which the number of overlapping boxes is estimated."""
+"""Number of edges sampled to estimate the number of overlapping boxes."""
 Vector = tuple[float, float, float]
 """A point or vector in compiled code, where small arrays would be slow."""
 
@@ -112,7 +112,7 @@ def _closest_of_candidates(
 class ClosestPoints:
     """Closest points of a triangulated surface to some points.
 
-    ``distance (n,)`` mm, ``triangle (n,)`` that holds each closest point, and its ``barycentric
+    ``distance (n,)`` mm, ``triangle (n,)`` containing each closest point, and its ``barycentric
     (n, 3)`` coordinates there.
     """
 
@@ -195,7 +195,7 @@ def has_intersections(vertices: FloatArray, triangles: IntArray) -> bool:
 def overlapping_boxes(vertices: FloatArray, triangles: IntArray) -> float:
     """Estimated number of pairs of an edge and a triangle whose bounding boxes overlap.
 
-    Time and memory of the intersection check are proportional to it. A valid surface has about ten
+    The intersection check needs time and memory in proportion. A valid surface has about ten pairs
     per edge, a tangle of triangles up to one per edge and triangle.
     """
     edges = surface_edges(triangles)
@@ -213,7 +213,7 @@ def intersecting_triangles(
 ) -> IntArray:
     """Pairs of intersecting triangles ``(k, 2)``, lower number first, each pair once.
 
-    Not everything is tested, see `has_intersections`. At most ``most`` candidate pairs (overlapping
+    Some kinds are not found, see `has_intersections`. At most ``most`` candidate pairs (overlapping
     boxes of an edge and a triangle) are tested; all by default.
     """
     if not has_intersections(vertices, triangles):
@@ -246,9 +246,9 @@ def plane_section(
     Returns
     -------
     segments
-        ``(k, 2, 3)`` mm, one for each triangle that is cut.
+        ``(k, 2, 3)`` mm, one for each cut triangle.
     triangle
-        ``(k,)`` these triangles.
+        ``(k,)`` indices of the cut triangles.
     """
     height = (np.asarray(vertices, dtype=np.float64) - origin) @ normal
     # A vertex on the plane counts as above it, so that no segment appears twice.

@@ -1,4 +1,4 @@
-"""Segmented leaflets and papillary muscles: midsurface, its error, and the papillary tips."""
+"""From segmented leaflets and papillary muscles to the midsurface, its error, and the tips."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from mvest.valve.geometry.thickening import thicken
 BEND_MM = 3.0
 """Bending radius of the leaflets at the commissures."""
 REPAIRS_MM = (0.0, 1.0, 2.0, 4.0)
-"""Additional smoothing that is tried if leaflets pass through themselves."""
+"""Additional smoothing lengths, tried in order if leaflets intersect themselves."""
 HEAD_MM = 5.0
-"""Height of the head of a muscle, from which its chordae arise."""
+"""Height of a muscle's head, from which its chordae arise."""
 MIN_SLENDER = 1.5
-"""Least length of a muscle over its width; a rounder one has no identifiable tip."""
+"""Smallest ratio of a muscle's length to its width; a rounder muscle has no identifiable tip."""
 MAX_AWAY = 60.0
 """Largest distance (mm) from the leaflets to the papillary tips."""
 TALLER = 1.1
@@ -44,12 +44,12 @@ def masks_midsurface(
     blur: float = 0.5,
     **known: Any,
 ) -> tuple[Midsurface, FloatArray]:
-    """The midsurface of labelled voxels, and the lengths ``(2,)`` mm of the seams.
+    """Compute the midsurface of labelled voxels, and the lengths ``(2,)`` mm of the seams.
 
     Parameters
     ----------
     masks
-        ``(I, J, K)`` each: both leaflets together, or the anterior and the posterior one.
+        ``(I, J, K)`` each: both leaflets together, or anterior and posterior separately.
     grid
         Spacing ``(3,)`` mm, direction ``(3, 3)`` (columns along i, j and k) and origin ``(3,)`` mm.
     tips : (2, 3) mm
@@ -91,7 +91,7 @@ def masks_midsurface(
 def without_crossings(
     surface: Midsurface, smoothing_mm: float, *, thickened: bool
 ) -> tuple[Midsurface, str]:
-    """The surface smoothed around the valve, and smoothed further if it passes through itself.
+    """Smooth the surface around the valve, and smooth it further if it intersects itself.
 
     Parameters
     ----------
@@ -99,18 +99,18 @@ def without_crossings(
     smoothing_mm
         See `mvest.valve.geometry.midsurface.Midsurface.smoothed`.
     thickened
-        Whether the thickened surface must not pass through itself either (for meshing).
+        Whether the thickened surface must not intersect itself either (for meshing).
 
     Returns
     -------
     Midsurface
     str
-        Description of the smoothing, empty without any.
+        Description of the smoothing; empty if there was none.
 
     Raises
     ------
     GeometryError
-        It passes through itself at every level of smoothing.
+        The surface intersects itself at every level of smoothing.
     """
     faults = []
     for further in REPAIRS_MM:
@@ -134,7 +134,7 @@ def without_crossings(
 
 
 def segmentation_std(voxel_mm: float, blur_mm: float, observer_mm: float) -> float:
-    """Standard deviation (mm) of a coordinate of the midsurface of a segmentation.
+    """Standard deviation (mm) of a midsurface coordinate from a segmentation.
 
     A wall is uniformly distributed within a voxel (standard deviation ``voxel / sqrt(12)``), and
     the midsurface is the mean of two walls. Gaussian smoothing of a signed distance moves a surface
@@ -145,19 +145,19 @@ def segmentation_std(voxel_mm: float, blur_mm: float, observer_mm: float) -> flo
 
 
 def papillary_tip(muscle: FloatArray, leaflets: FloatArray) -> FloatArray:
-    """The middle ``(3,)`` mm of a muscle's head, its last `HEAD_MM` along its long axis.
+    """Centre ``(3,)`` mm of a muscle's head: its last `HEAD_MM` along the long axis.
 
     Parameters
     ----------
     muscle
         ``(n, 3)`` mm, points of the muscle.
     leaflets
-        ``(m, 3)`` mm; the head is the end nearer to their middle.
+        ``(m, 3)`` mm; the head is the end nearer to their centre.
 
     Raises
     ------
     GeometryError
-        The muscle is not longer than wide.
+        The muscle is not slender (`MIN_SLENDER`).
     """
     middle = muscle.mean(axis=0)
     _, _, axes = np.linalg.svd(muscle - middle, full_matrices=False)
@@ -173,13 +173,13 @@ def papillary_tip(muscle: FloatArray, leaflets: FloatArray) -> FloatArray:
 
 
 def check_tips_of(surface: Midsurface, tips: FloatArray) -> None:
-    """Raise if tips and leaflets have different axes.
+    """Raise an error if tips and leaflets seem to use different axes.
 
     Parameters
     ----------
     surface
     tips
-        ``(2, 3)`` mm, LPS, the antero-lateral one first.
+        ``(2, 3)`` mm, LPS, antero-lateral tip first.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Validity checks of triangulated surfaces, and the volume they enclose.
 
-Every fault is one `GeometryError` that names the fault and the triangles, edges or vertices.
+Each fault raises a `GeometryError` that names the fault and the triangles, edges or vertices.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mvest.valve.geometry.proximity import (
 from mvest.valve.geometry.triangles import edge_table
 
 MAX_LOOKED_AT = 100_000
-"""Candidate pairs that are searched for the intersections named in a message."""
+"""Number of candidate pairs searched for the intersections named in a message."""
 MAX_OVERLAPS = 1e7
 """Largest number of overlapping bounding boxes (0.3 GB); 50 000 valid triangles have 1e6."""
 
@@ -155,13 +155,13 @@ def _check_edges(faces: IntArray, closed: bool, name: str) -> None:
 
 
 def _check_vertex_fans(faces: IntArray, name: str) -> None:
-    """Raise if the triangles around a vertex form several fans (sheets that meet in a point)."""
+    """Raise if the triangles around a vertex form several fans (sheets meeting at a point)."""
     _, _, inverse, count = edge_table(faces)
     order = np.argsort(inverse, kind="stable")
     ends = np.cumsum(count)
     second = order[ends[count == 2] - 1]
     first = order[ends[count == 2] - 2]
-    # Corner 3 t + i is where half-edge 3 t + i starts; neighbours run along their edge oppositely.
+    # Half-edge 3 t + i starts at corner 3 t + i; neighbours traverse their edge in opposite ways.
     after_first, after_second = (k - k % 3 + (k + 1) % 3 for k in (first, second))
     rows = np.concatenate([first, after_first])
     columns = np.concatenate([after_second, second])
@@ -180,7 +180,7 @@ def _check_vertex_fans(faces: IntArray, name: str) -> None:
 def enclosed_volume(vertices: FloatArray, triangles: IntArray) -> float:
     """Volume (mm³) inside a closed surface, positive when its normals point outwards.
 
-    Divergence theorem over the tetrahedra of the triangles with the centre of the vertices.
+    Sums the tetrahedra that the triangles form with the centre of the vertices.
     """
     points = np.asarray(vertices, dtype=np.float64)
     a, b, c = np.moveaxis((points - points.mean(axis=0))[triangles], 1, 0)

@@ -7,13 +7,13 @@ loops. It has two natural coordinates,
 * ``theta``: the angle around the valve, harmonic without flux through either edge, period 2 pi.
 
 Both solve Laplace's equation with the cotangent weights of linear triangles (Pinkall and Polthier
-1993, Exp. Math. 2:15). Together they map the band to a flat strip, almost conformally once ``s`` is
-scaled by ``modulus``.
+1993, Exp. Math. 2:15). Together they map the band to a flat strip; with ``s`` scaled by
+``modulus`` the map is almost conformal.
 
 Between obtuse triangles a cotangent weight is negative, and the map may fold over. With positive
 weights it cannot (Gortler, Gotsman and Thurston 2006, Comput. Aided Geom. Des. 23:83). So small and
-negative weights around folded triangles are raised until none is left; the coordinates are harmonic
-except at those few edges.
+negative weights around folded triangles are raised until no fold is left. The coordinates are
+harmonic except at those few edges.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import edge_table, unit_rows
 
 MIN_WEIGHT = 0.05
-"""Least cotangent weight around folded triangles; an equilateral triangle has 0.58."""
+"""Smallest cotangent weight around folded triangles; an equilateral triangle has 0.58."""
 MAX_ROUNDS = 10
-"""Largest number of times that weights are raised around the triangles still folded."""
+"""Largest number of rounds of raising weights around folded triangles."""
 OUTSIDE = 0.01
-"""Share of a turn beyond which a point lies outside the surface; less is a rounding error of s."""
+"""A point farther outside than this (in turns) is not on the surface; less is rounding of s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class SurfaceCoordinates:
     theta, s : (n,)
         Angle around the valve in [0, 2 pi), and 0 (annulus) to 1 (free edge).
     modulus : float
-        Length of the strip for a width of 2 pi: ``(theta, modulus * s)`` is near conformal.
+        Length of the strip for a width of 2 pi: ``(theta, modulus * s)`` is nearly conformal.
     circumferential : ndarray
         ``(n, 3)`` unit tangents parallel to the annulus (perpendicular to the gradient of ``s``).
     """
@@ -214,7 +214,7 @@ def _solve(
 
 
 def _raised(laplacian: sp.csr_matrix, near: BoolArray) -> sp.csr_matrix:
-    """The same with weights of at least `MIN_WEIGHT` at the vertices ``near (n,)``."""
+    """The Laplacian with weights raised to `MIN_WEIGHT` at the vertices ``near (n,)``."""
     edges = sp.triu(laplacian, k=1).tocoo()
     here = near[edges.row] | near[edges.col]
     weight = np.where(here, np.maximum(-edges.data, MIN_WEIGHT), -edges.data)
@@ -245,7 +245,7 @@ def _conjugate_angle(
 
     A jump of 2 pi across a cut from edge to edge is a closed form with that period. Subtracting the
     gradient that makes it divergence-free leaves the harmonic form. The cut runs along the surface,
-    because closed leaflets may lie across the axis.
+    because closed leaflets may cross the axis.
     """
     row, column = _cut(triangles, annulus, free_edge).T
     jump = 2 * np.pi * -np.asarray(laplacian[row, column]).ravel()
@@ -281,7 +281,7 @@ def _cut(triangles: IntArray, annulus: IntArray, free_edge: IntArray) -> IntArra
     start = (int(annulus[0]), int(annulus[1]))
     along = start in owner
     start = start if along else start[::-1]
-    # Triangle -> the edge through which it was entered, in its own direction.
+    # Triangle -> the edge through which the chain entered it, in the triangle's direction.
     entered = {owner[start]: start}
     queue = deque(entered)
     crossed: list[tuple[int, int]] = []
@@ -323,7 +323,7 @@ def _locate_in_plane(
 ) -> tuple[IntArray, FloatArray]:
     """Triangle ``(n,)`` and weights ``(n, 3)`` of points in a periodic strip.
 
-    One of the dozen nearest triangles nearly always holds the point; otherwise all are searched.
+    One of the dozen nearest triangles nearly always contains the point; otherwise all are searched.
     """
     m, shift = len(corners), np.array([period, 0.0])
     repeated = np.concatenate([corners - shift, corners, corners + shift])

@@ -1,4 +1,4 @@
-"""Thickening a midsurface to the closed surface of its leaflets."""
+"""Thickens a midsurface to the closed surface of its leaflets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def smooth_vertex_normals(
 ) -> FloatArray:
     """Unit normals ``(n, 3)`` after Laplacian smoothing over neighbouring vertices.
 
-    Each iteration replaces a normal by the normalised mean of itself and its neighbours' mean.
+    Each iteration averages a normal with the mean of its neighbours' normals, and normalises it.
     Thickening along raw normals would make triangles cross at sharp bends, such as the commissures.
 
     Raises
@@ -80,7 +80,7 @@ def _normals_change(
 
 
 def _across(normals: FloatArray, change: FloatArray) -> FloatArray:
-    """The part of ``(n, 3, q)`` across unit normals ``(n, 3)``."""
+    """The component of ``(n, 3, q)`` perpendicular to unit normals ``(n, 3)``."""
     along = np.einsum("ni,niq->nq", normals, change)
     return np.asarray(change - normals[:, :, None] * along[:, None])
 
@@ -120,8 +120,8 @@ def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> Close
     Raises
     ------
     GeometryError
-        The midsurface is invalid, or the thickened surface passes through itself (the thickness
-        exceeds the radius of curvature).
+        The midsurface is invalid, or the thickened surface intersects itself (the thickness exceeds
+        the radius of curvature).
     """
     check_surface(surface.vertices, surface.triangles, name="midsurface")
     if normals is None:

@@ -1,13 +1,13 @@
 """Triangulations: edges, areas and normals, stretch between two shapes, and refinement.
 
 A refined surface is a fixed linear function of the coarse vertices. Facets of a curved surface
-(edge length h, radius r) lie ``h² / 8 r`` inside it, and the normals of neighbours differ by
-``h / r``: 0.1 mm and 20 degrees where leaflets bend. Edges are halved by Hermite's cubic, with mean
-gradients of the position over the surface at rest, taken from the triangles at both ends::
+(edge length h, radius r) are ``h² / 8 r`` inside it, and neighbouring normals differ by ``h / r``:
+0.1 mm and 20 degrees where leaflets bend. Edges are halved with a Hermite cubic. Its gradients of
+the position over the surface at rest are averages over the triangles at both ends::
 
     (a + b) / 2 + (b - a) . (grad_a - grad_b) / 8
 
-The weights depend on the surface at rest alone, so derivatives by the vertices are exact.
+The weights depend only on the surface at rest, so derivatives by the vertices are exact.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mvest.typing import FloatArray, IntArray
 
 
 def area_vectors(vertices: FloatArray, triangles: IntArray) -> FloatArray:
-    """Normals ``(m, 3)`` of triangles, as long as their area in mm²."""
+    """Normals ``(m, 3)`` of triangles, with length equal to the area in mm²."""
     corner = vertices[triangles]
     return 0.5 * np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
@@ -41,7 +41,7 @@ def area_vectors_change(vertices: FloatArray, triangles: IntArray, moves: FloatA
 
 
 def directed_edges(triangles: IntArray) -> IntArray:
-    """Directed edges ``(3 m, 2)``: first all from corner 0, then those from 1, then from 2."""
+    """Directed edges ``(3 m, 2)``: first all from corner 0, then all from 1, then all from 2."""
     return np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
@@ -83,14 +83,14 @@ def unit_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
 
 
 def unit_rows(vectors: FloatArray) -> FloatArray:
-    """Vectors ``(n, 3)`` at length one; those of no length stay."""
+    """Vectors ``(n, 3)`` scaled to unit length; zero vectors are unchanged."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
 
 
 def mean_fibre(fibre: FloatArray, weights: FloatArray) -> FloatArray:
     """Weighted sum ``(..., 3)`` of the fibres ``(..., 3, 3)`` of a triangle's corners.
 
-    Fibres have no sign: all are turned to agree with that of the largest weight ``(..., 3)``.
+    Fibres have no sign: all are aligned with the one of largest weight ``(..., 3)``.
     """
     lead = np.take_along_axis(fibre, weights.argmax(axis=-1)[..., None, None], axis=-2)
     sign = np.where(np.sum(fibre * lead, axis=-1) < 0, -1.0, 1.0)
@@ -121,17 +121,17 @@ def principal_stretches(
 
 
 MAX_TRIANGLES = 100_000
-"""Of a refined surface."""
+"""Largest number of triangles of a refined surface."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
     """A finer surface."""
 
-    #: (r, n) sparse, fine vertices from the coarse ones, which come first and stay
+    #: (r, n) sparse, maps coarse to fine vertices; the coarse ones come first, unmoved
     weights: sparse.csr_array
     triangles: IntArray  #: (m, 3)
-    parent: IntArray  #: (m,), coarse triangle that holds each fine one
+    parent: IntArray  #: (m,), coarse triangle containing each fine one
     loops: tuple[IntArray, ...]  #: tuple of (e,), refined closed loops along edges
 
 
@@ -141,7 +141,7 @@ def refined(
     edge_length: float,
     loops: tuple[IntArray, ...] = (),
 ) -> Refinement:
-    """Halve the edges of a surface until their median is at most a length.
+    """Halve the edges of a surface until their median length is small enough.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def refined(
         At rest.
     triangles : (m, 3)
     edge_length : float
-        mm.
+        mm, largest median.
     loops : tuple of (e,)
         Vertices in the order of closed loops along edges.
     """
@@ -172,7 +172,7 @@ def _halved(vertices: FloatArray, coarse: Refinement) -> Refinement:
     middle = 0.5 * (own[a] + own[b])
     for along, slope in zip((x[b] - x[a]).T, _slopes(x, triangles), strict=True):
         middle = middle + sparse.diags_array(along / 8.0) @ (slope[a] - slope[b])
-    # Middles of the edges from corner 0, from 1 and from 2.
+    # Midpoints of the edges from corners 0, 1 and 2.
     p, q, r = n + number.reshape(-1, 3).T
     i, j, k = triangles.T
     parts = np.array([[i, p, r], [p, j, q], [r, q, k], [p, q, r]])

@@ -1,11 +1,11 @@
-"""The two walls of a thick leaflet band: its closed surface split along annulus and free edge.
+"""Splits the closed surface of a thick leaflet band into two walls, at annulus and free edge.
 
-A segmented surface does not state which of its triangles face the atrium. But two points opposite
-each other across the tissue belong to different walls, and two neighbours on a smooth part of the
-surface to the same wall. The sign of the lowest eigenvector of a signed graph Laplacian satisfies
-both best (Kunegis et al. 2010, SIAM Int. Conf. Data Mining, section 4). The point opposite a vertex
-is found with the largest inner ball that touches the surface there (shrinking balls: Ma, Bae and
-Choi 2012, Vis. Comput. 28:7).
+A segmented surface does not state which of its triangles face the atrium. But opposite points
+across the tissue belong to different walls, and neighbours on a smooth part of the surface to the
+same wall. The sign of the lowest eigenvector of a signed graph Laplacian satisfies both conditions
+best (Kunegis et al. 2010, SIAM Int. Conf. Data Mining, section 4). The largest inner ball touching
+the surface at a vertex gives the opposite point (shrinking balls: Ma, Bae and Choi 2012, Vis.
+Comput. 28:7).
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.triangles import euler_number, surface_edges
 
 MAX_THICKNESS = 8.0
-"""Diameter of the first ball, mm; thickened leaflets of diseased valves have 5 mm."""
+"""Diameter of the first ball, mm; diseased leaflets are up to 5 mm thick."""
 BALL_ROUNDS = 40
 MIN_SEPARATION = np.cos(np.radians(40.0))
-"""Cosine of the angle between the two contacts of a ball, seen from its centre, at which shrinking
-stops: a smaller angle means roughness of the same wall."""
+"""Shrinking stops at this cosine of the angle between a ball's two contacts, seen from its centre.
+A smaller angle means roughness of the same wall."""
 OPPOSITE = -0.6
 """Largest scalar product of the normals of two opposite points."""
 ACROSS_WEIGHT = 0.1
 """Weight of an opposite pair, relative to two neighbours on a plane."""
 EDGE_SHARE = 0.1
-"""Least distance of the dividing line from both ends of an edge, over its length."""
+"""Smallest distance of the dividing line from both ends of an edge, relative to its length."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,8 +55,8 @@ def closed_band(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, 
     Raises
     ------
     GeometryError
-        It is open or invalid, has several pieces, or has not one hole (Euler number 0): no orifice,
-        or leaflets joined where they only touch.
+        The surface is open, invalid or in several pieces, or has not exactly one hole (Euler number
+        0): there is no orifice, or leaflets that only touch are joined.
     """
     vertices = np.asarray(vertices, dtype=np.float64)
     triangles = np.asarray(triangles, dtype=np.int64)
@@ -112,7 +112,7 @@ def walls(vertices: FloatArray, triangles: IntArray) -> tuple[Wall, Wall]:
                 "expected an annulus and a free edge: the surface is no thin sheet everywhere"
             )
         parts.append((used, inverse.reshape(-1, 3), loops))
-    # The loops of the other wall run backwards: both walls take those of the first.
+    # The other wall's loops run backwards, so both walls use those of the first.
     number = [np.full(len(points), -1) for _ in parts]
     for own, (used, _, _) in zip(number, parts, strict=True):
         own[used] = np.arange(len(used))
@@ -129,7 +129,7 @@ def _graph(edges: IntArray, weight: FloatArray, n: int) -> sp.csr_matrix:
 
 
 def _across(vertices: FloatArray, normals: FloatArray) -> IntArray:
-    """The vertex ``(n,)`` opposite each one across the tissue; -1 if none was found."""
+    """Index ``(n,)`` of the vertex across the tissue from each vertex; -1 if none was found."""
     tree = cKDTree(vertices)
     n = len(vertices)
     radius = np.full(n, 0.5 * MAX_THICKNESS)
@@ -158,7 +158,7 @@ def _across(vertices: FloatArray, normals: FloatArray) -> IntArray:
 
 
 def _sides(vertices: FloatArray, triangles: IntArray) -> FloatArray:
-    """A number ``(n,)`` for each vertex, positive on one wall and negative on the other."""
+    """A value ``(n,)`` per vertex, positive on one wall and negative on the other."""
     normals = vertex_normals(vertices, triangles)
     edges = surface_edges(triangles)
     n = len(vertices)
@@ -187,7 +187,7 @@ def _sides(vertices: FloatArray, triangles: IntArray) -> FloatArray:
 
 
 def _in_two_pieces(side: FloatArray, edges: IntArray) -> FloatArray:
-    """The same with isolated islands of either sign flipped, so that each sign is one piece."""
+    """Flip isolated islands of either sign, so that each sign forms one piece."""
     side = side.copy()
     for sign in (1, -1):
         within = side * sign > 0
@@ -209,7 +209,7 @@ def _parted(
     vertices, triangles
         ``(n + k, 3)`` and ``(m', 3)``.
     upper
-        ``(m',)`` whether a triangle lies where `side` is positive.
+        ``(m',)`` whether `side` is positive on a triangle.
     """
     above = side > 0
     edges = surface_edges(triangles)
