@@ -153,6 +153,7 @@ def test_contradictions(tmp_path, change, message):
     ("old", "new", "message"),
     [
         ("type=T3D2", "type=B31", r"line \d+, \*ELEMENT: type B31, expected S4R, S3, T3D2"),
+        ("*Nset, nset=Rim\n1,", "*Ngen, nset=Rim\n1,", r"\*NGEN: is not read"),
         ("*Nset, nset=Rim", "*Nset, nset=Rand", "no node set 'Rim'; there are ALL"),
         (".65, 5\n", "", "shells without a section that states a thickness"),
         ("Valve.Both, SPOS", "Valve.Both, SNEG", "expected one pressure on all leaflets"),

@@ -169,7 +169,10 @@ BAD: dict[str, Bad] = {
     "spacing in cm": of_nrrd(PLACE, "0.05 to 5 mm", **{PLACE: CM}),
     "origin far away": of_nrrd(
         "space origin", "coordinates in mm", **{"space origin": "(1e6,0,0)"}),
+    "space units": of_nrrd(
+        "space units", "mm, cm, m or um", **{"space units": '"mm" "inch" "mm"'}),
     "ms taken for s": of_nrrd(VALUES, "less than 1 s", **{TIMES: "0 30 60"}),
+    "s taken for ms": of_nrrd(VALUES, "at least 0.002 s", units='"ms" "" "" ""'),
     "a time is missing": of_nrrd(VALUES, "each of 3 frames", **{TIMES: "0 0.03"}),
     "a segmentation": of_nrrd("Segmentation_A", "an image", **{"Segmentation_A=": "Leaf"}),
     "fewer voxels than bytes": of_nrrd("damaged", "", sizes="3 16 17 20"),
