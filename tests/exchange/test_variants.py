@@ -59,7 +59,7 @@ def test_a_volume(variant: Variant, tmp_path: Path) -> None:
     np.testing.assert_allclose(found.times, volume_variants.TIMES[:count], rtol=0, atol=1e-7)
     np.testing.assert_allclose(found.spacing, volume_variants.SPACING, rtol=1e-6)
     if path.suffix == ".dcm":
-        return  # its axes are a convention: `test_field_inputs`
+        return  # its axes are a convention: `test_volumes`
     np.testing.assert_allclose(found.direction, volume_variants.DIRECTION, rtol=0, atol=1e-6)
     np.testing.assert_allclose(found.origin, volume_variants.ORIGIN, rtol=0, atol=1e-4)
 

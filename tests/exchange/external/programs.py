@@ -19,6 +19,8 @@ with open(folder / "count.txt", "a") as stream:
     stream.write("ran\\n")
 if how == ["crash"]:
     sys.exit("out of licences")
+if how == ["sleep"]:
+    time.sleep(60)
 if min(k1, k2) <= 0:
     answer = {"status": "failed", "reason": f"k1 = {k1}: expected > 0"}
 else:
@@ -55,11 +57,3 @@ def model(folder: Path, *how: str, source: str = SPRINGS, limit: float = 30.0, *
     arguments = (sys.executable, "-I", "-S", str(program))
     command = Command((*arguments, "{request}", "{folder}", *how), time_limit_s=limit)
     return ProcessModel(command, folder / "runs", NAMES, 2, units=("N/mm", "N/mm"), **more)
-
-
-def answering(body: str) -> str:
-    """A program that writes an answer in order, and then does something else to it."""
-    return (
-        SPRINGS + "\n" + "observation = folder / 'observation.csv'\n"
-        "response = folder / 'response.json'\njacobian = folder / 'jacobian.csv'\n" + body
-    )

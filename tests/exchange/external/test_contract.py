@@ -54,8 +54,6 @@ ORDER = '{"format": "mvest-external", "version": 1, "status": "converged", "reas
         ("response.json", None, "response.json is missing"),
         ("response.json", ORDER.replace("converged", "ok"), "status: 'ok', expected"),
         ("response.json", ORDER + " " * 1_000_001, "expected at most 1000000"),
-        ("observation.csv", "1,2,3\n4,5,6\n", "columns 1,2,3"),
-        ("observation.csv", "x,y,z\n1,2,3\n", "1 rows, expected 2"),
         ("observation.csv", "x,y,z\n1,2,3\n4,nan,6\n", "y of row 1 is 'nan'"),
         ("jacobian.csv", "E,nu\n" + "1,2\n" * 6, "columns E,nu, expected E,nu, local"),
         ("jacobian.csv", 'E,"nu, local"\n' + "1,2\n" * 5, "5 rows, expected 6"),

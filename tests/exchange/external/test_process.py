@@ -36,23 +36,6 @@ def test_placeholders_are_filled_once_even_if_the_folder_looks_like_one(tmp_path
     assert (place, law) == (str(folder), "a;b $HOME")
 
 
-def test_a_program_that_takes_too_long_is_stopped_with_its_children(tmp_path):
-    # The child would write after 1.5 s; the program itself ignores the polite signal.
-    child = "import time, pathlib; time.sleep(1.5); pathlib.Path('late').touch()"
-    code = (
-        "import signal, subprocess, sys, time\n"
-        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
-        f"subprocess.Popen([sys.executable, '-I', '-S', '-c', {child!r}])\n"
-        "sys.stderr.write('step 1 of 9\\n'); sys.stderr.flush(); time.sleep(60)"
-    )
-    began = time.monotonic()
-    reason = run(python(code, time_limit_s=0.4), tmp_path)
-    assert time.monotonic() - began < 10
-    assert reason == "stopped at the time limit of 0.4 s; its last words: step 1 of 9"
-    time.sleep(1.5)
-    assert not (tmp_path / "late").exists()
-
-
 def test_what_an_ended_program_leaves_behind_is_stopped(tmp_path):
     child = "import time, pathlib; time.sleep(0.8); pathlib.Path('late').touch()"
     code = f"import subprocess, sys; subprocess.Popen([sys.executable, '-S', '-c', {child!r}])"

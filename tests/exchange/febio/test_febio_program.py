@@ -11,7 +11,7 @@ from mvest.mechanics.body import simulate_body
 from mvest.mechanics.law import Law
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import NewtonSettings
-from tests.exchange.febio.program import febio_program, read_positions, run_febio
+from tests.exchange.febio.program import febio_program, run_febio
 from tests.exchange.febio.test_febio_mesh import mesh_of
 from tests.mechanics.bodies import SaintVenantKirchhoff
 
@@ -79,14 +79,3 @@ def test_a_sheet_is_the_same_where_element_and_law_are(kind, difference, program
     # Another law is not the same at these strains.
     other = ours(mesh, fibre, rim, MATERIAL)
     assert np.abs(other.frames[-1] - here.frames[-1]).max() > 1e-3
-
-
-STEP = "*Step  = {}\n*Time  = {}\n*Data  = positions\n1,0,0,{}\n2,1,0,{}\n"
-
-
-def test_positions_are_read_and_a_broken_step_left_out(tmp_path):
-    text = STEP.format(0, 0, 0.5, 0.25) + STEP.format(1, 0.1, 1.5, 1.25)
-    (tmp_path / "log.csv").write_text(text + "*Step  = 2\n*Time  = 0.2\n1,0,0,1\n")
-    times, frames = read_positions(tmp_path / "log.csv", 2)
-    np.testing.assert_array_equal(times, [0.0, 0.1])
-    np.testing.assert_array_equal(frames[1], [[0, 0, 1.5], [1, 0, 1.25]])

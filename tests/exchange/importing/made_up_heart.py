@@ -4,6 +4,7 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+import trimesh
 
 from experiments.studies.imported import HeartSettings
 from mvest.valve.anatomy.template import Template
@@ -22,20 +23,9 @@ SHIFT = np.array([40.0, 470.0, -12.0])
 
 
 def muscle(tip):
-    """A closed spindle 40 mm long and 8 mm wide below a tip, which is the middle of its head."""
-    around, rows = 16, np.linspace(0.5 * HEAD_MM, 0.5 * HEAD_MM - 40.0, 43)
-    angle = 2 * np.pi * np.arange(around) / around
-    radius = 4.0 * np.sqrt(np.sin(np.linspace(0.02, np.pi - 0.02, len(rows))))
-    ring = np.column_stack([np.cos(angle), np.sin(angle)])
-    points = np.concatenate(
-        [np.column_stack([r * ring, np.full(around, z)]) for r, z in zip(radius, rows, strict=True)]
-    )
-    a = np.arange(around * (len(rows) - 1))
-    b = a // around * around + (a + 1) % around
-    side = np.concatenate(
-        [np.column_stack([a, a + around, b]), np.column_stack([b, a + around, b + around])]
-    )
-    return tip + points, side
+    """A spindle 40 mm long and 8 mm wide below a tip, which is the middle of its head."""
+    found = trimesh.creation.icosphere(subdivisions=4)
+    return tip + found.vertices * [4.0, 4.0, 20.0] - [0, 0, 20.0 - 0.5 * HEAD_MM], found.faces
 
 
 def parts():

@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from experiments.studies.imported import import_heart
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.plausibility import implausible_values
 from mvest.errors import InputError
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.segmented import HEAD_MM, papillary_tip
 from tests.exchange.importing.made_up_heart import (
     PARTS,
     SHIFT,
@@ -108,22 +106,3 @@ def test_the_heart_itself_is_a_plausible_valve():
     tips = case.frames[0].papillary_tips
     assert np.linalg.norm(tips[0] - tips[1]) == pytest.approx(24.1, abs=0.5)
     assert len(case.chordae) == 34
-
-
-def muscle(length=30.0, width=8.0):
-    """Half a spheroid of that length along z from its base, tip up."""
-    rng = np.random.default_rng(3)
-    z = rng.uniform(0.0, 1.0, 4000)
-    angle = rng.uniform(0.0, 2 * np.pi, len(z))
-    radius = 0.5 * width * np.sqrt(1 - z**2)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), length * z])
-
-
-def test_the_head_is_found_at_the_end_towards_the_leaflets():
-    rng = np.random.default_rng(0)
-    turn, shift = Rotation.random(rng=rng).as_matrix(), rng.uniform(-50, 50, 3)
-    leaflets = np.array([[5.0, 3.0, 45.0], [-5.0, 0.0, 50.0]])
-    tip = papillary_tip(muscle() @ turn.T + shift, leaflets @ turn.T + shift)
-    back = (tip - shift) @ turn
-    # Points are even along z: the middle of the last HEAD_MM.
-    np.testing.assert_allclose(back, [0.0, 0.0, 30.0 - 0.5 * HEAD_MM], atol=0.4)

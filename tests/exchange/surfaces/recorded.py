@@ -112,13 +112,8 @@ def deck(data: dict) -> str:
     lines += ["*Amplitude, name=Whole, definition=SMOOTH STEP", "0., 0., 1., 1."]
     lines += ["*Amplitude, name=Early, definition=SMOOTH STEP", "0., 0., 0.5, 1."]
     for name in REGIONS:
-        lines += [
-            f"*Material, name={name}_Chordae",
-            "*Density",
-            "1e-9",
-            "*Hyperelastic, OGDEN, N=3",
-        ]
-        lines += [f"{OGDEN[name][1]}, 1e-5, 0", "0.,"]
+        lines += [f"*Material, name={name}_Chordae", "*Density", "1e-9"]
+        lines += ["*Hyperelastic, OGDEN, N=3", f"{OGDEN[name][1]}, 1e-5, 0", "0.,"]
     lines += ['*Step, name="Closure of it", nlgeom=YES', "*Dynamic, Explicit", ", 1."]
     for node, vector in zip(data["held"].tolist(), data["displacement"].tolist(), strict=True):
         pace = "Whole" if node in data["rim"] else "Early"

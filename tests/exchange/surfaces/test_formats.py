@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.surfaces import Surface, merged, read_mesh, read_regions, read_surface
+from mvest.exchange.surfaces import read_mesh, read_regions, read_surface
 from tests.exchange.surfaces.glb import described, write_parts
 
 REGIONS = {0: "anterior", 1: "posterior"}
@@ -86,12 +86,3 @@ def test_nodes_place_what_is_below_them(tmp_path):
     # Normals point upwards still.
     sides = np.diff(corners["mirror"], axis=1)
     assert np.cross(sides[:, 0], sides[:, 1])[:, 2].min() > 0
-
-
-def test_merged_vertices_are_numbered_by_the_triangles():
-    order = np.array([7, 2, 0, 5, 8, 1, 4, 3, 6])
-    points = np.empty((9, 3))
-    points[order] = POINTS[TRIANGLES].reshape(-1, 3)
-    found = merged(Surface(points, order.reshape(-1, 3)))
-    np.testing.assert_array_equal(found.vertices[found.triangles], POINTS[TRIANGLES])
-    assert found.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [1, 4, 5]]

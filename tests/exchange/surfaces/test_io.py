@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.exchange.surfaces import (
-    Surface,
-    read_mesh,
-    read_surface,
-    write_surface,
-    write_surface_series,
-)
+from mvest.exchange.surfaces import read_surface, write_surface
 from tests.valve.conftest import shapes
 
 __all__ = ["shapes"]
@@ -34,17 +28,6 @@ def test_a_surface_comes_back_exactly(shapes, tmp_path):
         assert back.point_data[name].dtype == values.dtype
     for name, values in cells.items():
         np.testing.assert_array_equal(back.cell_data[name], values)
-
-
-def test_a_series_is_an_index_of_files_that_name_their_axes(shapes, tmp_path):
-    vertices, triangles = shapes.box()
-    states = [Surface(vertices + k, triangles, {"x": vertices[:, 0]}) for k in range(3)]
-    index = write_surface_series(tmp_path / "valve.pvd", [0.0, 0.5, 1.0], states)
-    assert index.read_text().count("DataSet ") == 3
-    assert 'timestep="0.5" file="valve_0001.vtp"' in index.read_text()
-    mesh = read_mesh(tmp_path / "valve_0001.vtp")
-    assert mesh.space == "LPS"
-    np.testing.assert_array_equal(mesh.vertices, vertices + 1)
 
 
 @pytest.mark.parametrize(
