@@ -59,18 +59,14 @@ def configuration():
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_every_job_composes_and_is_distinct(configuration, name: str) -> None:
-    size = "full"
-    planned = jobs(name, size)
+    planned = jobs(name, "full")
     # Composing takes a tenth of a second: the last job and a regular choice of the others.
     chosen = [*planned[: -1 : len(planned) // 4 + 1], planned[-1]]
     hashes, seen = set(), {}
     for overrides in chosen:
-        config_hash, config = composed(f"sweep={name}", f"sweep.size={size}", *overrides)
+        config_hash, config = composed(f"sweep={name}", "sweep.size=full", *overrides)
         hashes.add(config_hash)
         assert config["name"] == config["table"] == f"sweep_{name}"
-        assert config["sweep"]["name"] == name
-        assert config["title"]
-        assert config["publish"]
         assert config["factors"]
         assert all(isinstance(v, str | int | float) for v in config["factors"].values())
         # Jobs that differ in the seed only are one cell of a table.
@@ -82,15 +78,14 @@ def test_every_job_composes_and_is_distinct(configuration, name: str) -> None:
     assert len(rows) == len(planned)
 
 
-@pytest.mark.parametrize(("name", "step"), [("discrepancy", 8)])
-def test_jobs_composed_one_after_another_are_as_each_alone(configuration, name, step) -> None:
-    config = compose("config", [f"sweep={name}"], return_hydra_config=True)
+def test_jobs_composed_one_after_another_are_as_each_alone(configuration) -> None:
+    config = compose("config", ["sweep=discrepancy"], return_hydra_config=True)
     loader = GlobalHydra.instance().config_loader()
     # Groups, values within what a group chose, and values on the command line.
-    said = [f"sweep={name}", "seed=3,1", "filter.initial=[5.0,3.0],[9,6.0]"]
+    said = ["sweep=discrepancy", "seed=3,1", "filter.initial=[5.0,3.0],[9,6.0]"]
     plan = make_plan(config, loader, expand(config, said, loader))
     assert len({job.config_hash for job in plan.jobs}) == len(plan.jobs)
-    for job in plan.jobs[::step]:
+    for job in plan.jobs[::8]:
         config_hash, values = composed(*job.overrides)
         # Which a job by itself does not have.
         values["time_limit_s"] = TIME_LIMIT_S
@@ -99,7 +94,7 @@ def test_jobs_composed_one_after_another_are_as_each_alone(configuration, name, 
         values["factors"] = job.values["factors"]
         assert json.dumps(job.values, sort_keys=True) == json.dumps(values, sort_keys=True)
         assert job.config_hash == config_hash
-        assert job.folder == Path("outputs") / f"sweep_{name}" / config_hash[:16]
+        assert job.folder == Path("outputs") / "sweep_discrepancy" / config_hash[:16]
 
 
 def test_the_truth_of_a_discrepancy_is_another_one_and_its_key_too(configuration, tmp_path) -> None:
@@ -112,8 +107,6 @@ def test_the_truth_of_a_discrepancy_is_another_one_and_its_key_too(configuration
         assert twin.model.fixed == {}
         if config["truth"]["label"] == "Poisson reading C":
             assert {t.reading for t in twin.truth_model.settings.tissue.values()} == {"C"}
-        if config["truth"]["label"] == "pressure +10 %":
-            assert twin.truth_model.fixed == {"pressure_scale": 1.1}
         if config["truth"]["label"] == "E_f/E_perp +20 %":
             assert twin.truth_model.settings.tissue["anterior"].ratio == 3.181
             assert twin.model.settings.tissue["anterior"].ratio == pytest.approx(2.651, abs=1e-3)
