@@ -54,10 +54,9 @@ def runs() -> list[int]:
 
 
 def mvest(*arguments: str, **settings) -> subprocess.Popen[str]:
-    places = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     return subprocess.Popen(
         [sys.executable, "-c", WORKER, FAKE, *arguments],
-        env=os.environ | {"PYTHONPATH": places},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -110,13 +110,11 @@ def test_a_dry_run_lists_what_would_run_and_touches_nothing(run):
     assert (status, err) == (0, "")
     assert not Path("outputs").exists()
     assert out.count("  run   ") == 4
-    assert "time unknown" in out
     Path("raise-2").touch()
     run("sweep=debug")
     _, out, _ = run("sweep=debug", "dry_run=true")
     assert out.count("  done  ") == 3
     assert "seed=2 [failed before: RuntimeError: it broke]" in " ".join(out.split())
-    assert "about " in out
     assert len(runs()) == 4
 
 
@@ -197,7 +195,6 @@ WRONG = [
     ),
     (("sweep=debug", "sweep.size=huge"), "sweep.size = 'huge', expected one of small, full"),
     (("sweep=debug", "seed=interval(1,2)"), "does not support sweep type"),
-    (("sweep=debug", "hydra.launcher.cluster=PBS"), "hydra.launcher.cluster = PBS, expected"),
     (("sweep=debug", "filter.P0=0.01,-1"), "(job filter.initial=[5,3] seed=1 "),
     (("sweep=debug", "filter.initial=[5,3],[5.0,3.0]"), "one and the same: filter.initial=[5,3]"),
 ]  # fmt: skip

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.sweeps.collected import Sweep, head_of, read_sweep, write_sweep_file
+from experiments.sweeps.collected import Sweep, read_sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import InputError
 from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, lost, run, sweep
@@ -30,9 +30,7 @@ def test_a_sweep_comes_back_from_its_file(tmp_path, whole):
     back = read_sweep(tmp_path / "a.json")
     assert [one.hash for one in back.jobs] == [one.hash for one in whole.jobs]
     for ours, theirs in zip(back.records, whole.records, strict=True):
-        assert head_of(ours).model_dump(exclude={"estimates"}) == head_of(theirs).model_dump(
-            exclude={"estimates"}
-        )
+        assert (ours.status, ours.row, ours.factors) == (theirs.status, theirs.row, theirs.factors)
         assert [one.unknowns for one in ours.estimates] == [
             one.unknowns for one in theirs.estimates
         ]
