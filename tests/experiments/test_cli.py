@@ -84,7 +84,7 @@ def test_the_name_of_an_experiment_stands_for_it():
     assert cli.named("table1") == "experiment=table1"
     others = ["-m", "seed=1,2", "~filter"]
     assert [cli.named(one) for one in others] == others
-    with pytest.raises(ConfigurationError, match="tabel1: no such .*mean experiment=table1"):
+    with pytest.raises(ConfigurationError, match=r"tabel1: no such .*mean experiment=table1"):
         cli.named("tabel1")
 
 
