@@ -61,5 +61,5 @@ def test_what_did_not_pass_the_gate_is_said_before_anything_else():
 def test_a_long_table_is_named_as_a_file(tmp_path):
     rows = table([{"x": float(k)} for k in range(61)], x="mm")
     record = made_up(table="t", tables={"": rows.plain()})
-    write_results(tmp_path, STUDY, Results({"t": record}))
+    write_results(tmp_path, Study(settings=Settings, run=STUDY.run), Results({"t": record}))
     assert "61 rows: t.csv" in (tmp_path / "t.md").read_text()
