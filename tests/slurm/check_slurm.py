@@ -46,12 +46,6 @@ def start(folder: Path, options: str = OPTIONS) -> subprocess.Popen[str]:
     )
 
 
-def end(sweep: subprocess.Popen[str]) -> str:
-    out, _ = sweep.communicate(timeout=PATIENCE)
-    print(out)
-    return out
-
-
 def until(find) -> str:
     """What ``find`` returns as soon as it is something."""
     stop = time.monotonic() + PATIENCE
@@ -60,11 +54,6 @@ def until(find) -> str:
             return found
         time.sleep(0.2)
     pytest.fail("waited in vain for Slurm")
-
-
-def statuses(folder: Path) -> list[str]:
-    swept = read_sweep(folder / "outputs" / "sweep_debug" / "sweep.json")
-    return [record.status for record in swept.records]
 
 
 def running() -> list[str]:
@@ -88,16 +77,17 @@ def test_the_jobs_of_a_killed_worker_run_again_on_another_one(tmp_path) -> None:
     sweep = start(tmp_path)
     until(lambda: len(running()) == 2)
     os.kill(int(until(lambda: worker_of(running()[0]))), signal.SIGKILL)
-    out = end(sweep)
+    out, _ = sweep.communicate(timeout=PATIENCE)
     assert sweep.returncode == 0, out
     assert "4 of 4 jobs done" in out
-    assert statuses(tmp_path) == ["converged"] * 4
+    swept = read_sweep(tmp_path / "outputs" / "sweep_debug" / "sweep.json")
+    assert [record.status for record in swept.records] == ["converged"] * 4
     until(lambda: not asked("squeue", "--noheader"))
 
 
 def test_what_slurm_refuses_is_one_line(tmp_path) -> None:
     sweep = start(tmp_path, "hydra.launcher.options={queue: nowhere, walltime: '00:30:00'}")
-    out = end(sweep)
-    assert sweep.returncode == 2
+    out, _ = sweep.communicate(timeout=PATIENCE)
+    assert sweep.returncode == 2, out
     assert "nowhere" in out
     assert "Traceback" not in out

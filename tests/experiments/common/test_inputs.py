@@ -96,11 +96,11 @@ def test_what_lies_there_is_in_the_hash(given, study, name):
     file.unlink()
     assert hash_of(configuration(study, name, value)) not in (first, changed)
     # A link that leads elsewhere now.
-    for content in "12":
+    for content, expected in (("1", first), ("2", changed)):
         (given / content).write_text(content)
         file.unlink(missing_ok=True)
         file.symlink_to(given / content)
-        assert hash_of(configuration(study, name, value)) == (first if content == "1" else changed)
+        assert hash_of(configuration(study, name, value)) == expected
 
 
 def test_the_data_that_a_header_names_beside_it_count(given):

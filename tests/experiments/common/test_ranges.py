@@ -71,17 +71,11 @@ def test_all_that_is_configured_is_inside(overrides: list[str]) -> None:
     [
         ("seed=-1", "seed = -1, expected 0 to 4294967295"),
         ("mesh.columns=0", "mesh.columns = 0, expected 1 to 400"),
-        ("time_limit_s=0", "time_limit_s = 0, expected 0.01 to 2592000 s"),
         ("truth.values=[-5,2]", "truth.values of E_f.anterior = -5, expected 1e-06 to 10000 MPa"),
-        ("+fixed.pressure_scale=1000", "fixed.pressure_scale = 1000, expected 0 to 100"),
-        ("observation.annulus_offset_mm=[0,0,2000]", "annulus_offset_mm = 2000, expected -1000"),
         ("valve.leaflets.anterior.thickness=11", "thickness = 11, expected 0.01 to 10 mm"),
-        ("mechanics.protocol.pressure_mmHg=501", "pressure_mmHg = 501, expected -100 to 500"),
         ("filter.R=[0.01,1e13]", "filter.R = 1e+13, expected"),
-        ("filter.method.tolerance=1e16", "filter.method.tolerance = 1e+16, expected"),
         ("+factors.a=1e16", "factors.a = 1e+16, expected -1e+15 to 1e+15"),
         (f"name={'a' * 121}", "name has more than 120 letters"),
-        (f"title={'a' * 10_001}", "title has"),
     ],
 )
 def test_a_number_outside_its_range_is_refused_by_name(override: str, message: str) -> None:

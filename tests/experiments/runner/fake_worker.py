@@ -1,7 +1,7 @@
 """The real worker with a study that takes no time and does what files in its folder say.
 
-``kill-SEED``, ``raise-SEED``, ``hog-SEED`` and ``full-SEED`` end the job of that seed, once. One
-with ``wait-SEED`` writes its process there and goes on when that is gone.
+``kill-SEED``, ``raise-SEED`` and ``hog-SEED`` end the job of that seed, once. One with
+``wait-SEED`` writes its process there and goes on when that is gone.
 Every run leaves a line in ``runs``.
 """
 
@@ -34,7 +34,7 @@ def run(job):
         order.write(str(os.getpid()))
     while wait.exists():
         time.sleep(0.02)
-    for name in ("kill", "raise", "hog", "full"):
+    for name in ("kill", "raise", "hog"):
         order = Path(f"{name}-{seed}")
         if not order.exists():
             continue
@@ -48,8 +48,6 @@ def run(job):
                 kept = []
                 while True:
                     kept.append(b"x" * 2**24)
-            case "full":
-                raise OSError(28, "No space left on device", str(job.folder / "result.json"))
     print(f"seed {seed}")
     unknowns = [
         Unknown(name=name, estimate=estimate, std=0.1, truth=truth)

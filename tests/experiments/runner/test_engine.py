@@ -82,25 +82,16 @@ def test_jobs_that_die_on_a_cluster_cost_their_own_rows(sweep):
 
 
 @pytest.mark.slow
-def test_the_job_of_a_killed_worker_is_run_again_by_itself(sweep, tmp_path):
+def test_the_job_of_a_killed_worker_is_run_again_by_itself(sweep):
     Path("wait-3").touch()
     running = sweep()
     until(lambda: Path("wait-3").read_text())
     job = int(Path("wait-3").read_text())
-    worker = next(pid for pid in parents(job) if pid in _dask_workers(tmp_path, running.pid))
-    os.kill(worker, signal.SIGKILL)
+    above = [pid for pid in parents(job) if running.pid in parents(pid)[:1]]
+    os.kill(next(pid for pid in above if "spawn_main" in command_of(pid)), signal.SIGKILL)
     until(lambda: runs().count(3) == 2)
     Path("wait-3").unlink()
     out, _ = running.communicate(timeout=300)
     assert running.returncode == 0, out
     assert "8 of 8 jobs done" in out
     assert sorted(set(runs())) == list(range(8))
-
-
-def _dask_workers(folder: Path, client: int) -> set[int]:
-    """Processes of dask's workers: children of the client that jobs hang below."""
-    return {
-        pid
-        for pid in living(folder)
-        if client in parents(pid)[:1] and "spawn_main" in command_of(pid)
-    }

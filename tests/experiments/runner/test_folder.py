@@ -1,15 +1,12 @@
 """The folder of a job: what an attempt leaves for the next one, and what it must not destroy."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from experiments.common.records import record as records
 from experiments.common.records.record import FIELDS
-from experiments.common.schema import build
 from experiments.common.study import Result
 from experiments.runner import jobs
 from experiments.runner.jobs import Request
@@ -86,16 +83,6 @@ def test_a_kill_while_arrays_and_record_are_replaced_loses_neither(tmp_path, mon
         assert computed.numbers == {"a_mm": 2.0}
         jobs.mark_done(tmp_path)
     assert number(asked) == (2.0 if step == "adopt_arrays" else 1.0)
-
-
-def test_a_request_keeps_its_overrides(tmp_path):
-    plain = request(tmp_path)
-    asked = Request(plain.values, plain.config_hash, tmp_path, None, ("seed=2", "+a='b c'"))
-    assert build(Request, json.loads(json.dumps(asked.to_json()))) == asked
-    jobs.write_hydra(asked)
-    place = tmp_path / jobs.HYDRA
-    assert yaml.safe_load((place / "overrides.yaml").read_text()) == ["seed=2", "+a='b c'"]
-    assert yaml.safe_load((place / "config.yaml").read_text()) == asked.values
 
 
 @pytest.mark.parametrize(("name", "left"), [("log.txt", True), (None, False)])

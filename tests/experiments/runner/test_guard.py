@@ -64,10 +64,6 @@ def converged(asked: Request, config_hash: str = "0" * 64, **arrays) -> Record:
     return record
 
 
-def changed(folder: Path, **entries) -> dict:
-    return json.loads((folder / "result.json").read_text()) | entries
-
-
 def said(folder: Path) -> dict:
     return json.loads((folder / "said.json").read_text())
 
@@ -76,9 +72,7 @@ def said(folder: Path) -> dict:
     ("order", "reason"),
     [
         ({"signal": int(signal.SIGKILL)}, "killed by signal 9 (SIGKILL"),
-        ({"signal": int(signal.SIGSEGV)}, "killed by signal 11 (SIGSEGV)"),
         ({"exit": 3}, "exit status 3"),
-        ({"exit": 0}, "exit status 0"),
         ({"sleep": 60, "limit": 0.2}, "time limit of 0.2 s"),
         ({"reason": "it buckled"}, "it buckled"),
         ({"reason": "mesh.rows = 0", "refused": True}, "mesh.rows = 0"),
@@ -139,8 +133,9 @@ def test_what_was_computed_outlives_whatever_ends_the_job_after_it(worker, tmp_p
 @pytest.mark.parametrize("content", ["", '{"version": 3, "provenance": 3}', None])
 def test_a_damaged_or_changed_result_is_none(worker, tmp_path, content):
     converged(request(tmp_path))
-    changes = json.dumps(changed(tmp_path, numbers={"a_mm": 2.0}))
-    (tmp_path / "result.json").write_text(changes if content is None else content)
+    result = tmp_path / "result.json"
+    changed = json.loads(result.read_text()) | {"numbers": {"a_mm": 2.0}}
+    result.write_text(json.dumps(changed) if content is None else content)
     mark_done(tmp_path)
     assert last_record(tmp_path, "0" * 64) is None
     assert run_in(worker, request(tmp_path, exit=3)).status == "failed"

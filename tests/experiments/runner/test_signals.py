@@ -16,6 +16,7 @@ from tests.places import ROOT
 from tests.processes import alive, gone, linux, until
 
 pytestmark = linux
+SLOW = pytest.mark.slow
 
 HELD = str(Path(__file__).with_name("held.py"))
 STATUS = {"KILL": -9, "INT": 130, "INT INT": 130}
@@ -23,11 +24,10 @@ STATUS = {"KILL": -9, "INT": 130, "INT INT": 130}
 
 
 def start(folder: Path, *more: str) -> subprocess.Popen[str]:
-    places = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     return subprocess.Popen(
         [sys.executable, HELD, "run", "sweep=debug", *more],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": places},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -50,13 +50,8 @@ def require_whole(folder: Path) -> None:
     ("stage", "signals", "more"),
     [
         ("simulating", "KILL", ("tracking.enabled=false", "hydra.launcher.n_jobs=2")),
-        *(
-            pytest.param(stage, signals, more, marks=pytest.mark.slow)
-            for stage, signals, more in (
-                ("drawing", "INT INT", ("tracking.enabled=false", "publish=true")),
-                ("logging", "INT", ()),
-            )
-        ),
+        pytest.param("drawing", "INT INT", ("tracking.enabled=false", "publish=true"), marks=SLOW),
+        pytest.param("logging", "INT", (), marks=SLOW),
     ],
 )
 def test_a_signal_leaves_nothing_behind(stage, signals, more, tmp_path):

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from experiments.common.building.filters import build_filter
 from experiments.common.building.twin import build_twin
 from experiments.common.cases.blind import SECRET
-from experiments.common.config import hash_of, register, require_in_range
+from experiments.common.config import hash_of, register
 from experiments.common.schema import build
 from experiments.runner.compose import expand, make_plan
 from experiments.runner.jobs import TIME_LIMIT_S
@@ -20,21 +20,6 @@ from mvest.simulation.virtual_patient import PatientSettings
 from tests.places import CONF
 
 SWEEPS = ("initial_guess", "covariance", "noise", "discrepancy", "filter")
-
-DEBUG = (
-    "mesh=coarse",
-    "observation.columns=24",
-    "observation.rows=7",
-    "mechanics.contact_points.columns=48",
-    "mechanics.contact_points.rows=20",
-    "mechanics.protocol.pressure_mmHg=5.0",
-    "mechanics.protocol.ramp=0.1",
-    "mechanics.protocol.dt=0.05",
-    "mechanics.protocol.end=0.1",
-    "mechanics.protocol.equilibrium=false",
-    "filter.method.max_iterations=3",
-)
-"""Any job in seconds: the settings of the quick check."""
 
 
 def jobs(name: str, size: str) -> list[list[str]]:
@@ -59,18 +44,14 @@ def configuration():
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_every_job_composes_and_is_distinct(configuration, name: str) -> None:
-    size = "full"
-    planned = jobs(name, size)
+    planned = jobs(name, "full")
     # Composing takes a tenth of a second: the last job and a regular choice of the others.
     chosen = [*planned[: -1 : len(planned) // 4 + 1], planned[-1]]
     hashes, seen = set(), {}
     for overrides in chosen:
-        config_hash, config = composed(f"sweep={name}", f"sweep.size={size}", *overrides)
+        config_hash, config = composed(f"sweep={name}", "sweep.size=full", *overrides)
         hashes.add(config_hash)
         assert config["name"] == config["table"] == f"sweep_{name}"
-        assert config["sweep"]["name"] == name
-        assert config["title"]
-        assert config["publish"]
         assert config["factors"]
         assert all(isinstance(v, str | int | float) for v in config["factors"].values())
         # Jobs that differ in the seed only are one cell of a table.
@@ -82,15 +63,14 @@ def test_every_job_composes_and_is_distinct(configuration, name: str) -> None:
     assert len(rows) == len(planned)
 
 
-@pytest.mark.parametrize(("name", "step"), [("discrepancy", 8)])
-def test_jobs_composed_one_after_another_are_as_each_alone(configuration, name, step) -> None:
-    config = compose("config", [f"sweep={name}"], return_hydra_config=True)
+def test_jobs_composed_one_after_another_are_as_each_alone(configuration) -> None:
+    config = compose("config", ["sweep=discrepancy"], return_hydra_config=True)
     loader = GlobalHydra.instance().config_loader()
     # Groups, values within what a group chose, and values on the command line.
-    said = [f"sweep={name}", "seed=3,1", "filter.initial=[5.0,3.0],[9,6.0]"]
+    said = ["sweep=discrepancy", "seed=3,1", "filter.initial=[5.0,3.0],[9,6.0]"]
     plan = make_plan(config, loader, expand(config, said, loader))
     assert len({job.config_hash for job in plan.jobs}) == len(plan.jobs)
-    for job in plan.jobs[::step]:
+    for job in plan.jobs[::8]:
         config_hash, values = composed(*job.overrides)
         # Which a job by itself does not have.
         values["time_limit_s"] = TIME_LIMIT_S
@@ -99,21 +79,20 @@ def test_jobs_composed_one_after_another_are_as_each_alone(configuration, name, 
         values["factors"] = job.values["factors"]
         assert json.dumps(job.values, sort_keys=True) == json.dumps(values, sort_keys=True)
         assert job.config_hash == config_hash
-        assert job.folder == Path("outputs") / f"sweep_{name}" / config_hash[:16]
+        assert job.folder == Path("outputs") / "sweep_discrepancy" / config_hash[:16]
 
 
 def test_the_truth_of_a_discrepancy_is_another_one_and_its_key_too(configuration, tmp_path) -> None:
     keys = {}
     for overrides in jobs("discrepancy", "small"):
-        _, config = composed("sweep=discrepancy", *overrides, *DEBUG, f"paths.outputs={tmp_path}")
+        usual = ("sweep=discrepancy", "mesh=coarse", f"paths.outputs={tmp_path}")
+        _, config = composed(*usual, *overrides)
         twin = build_twin(config)
         keys[config["truth"]["label"]] = twin.source.key
         assert twin.model.settings.tissue["anterior"].reading == "A"
         assert twin.model.fixed == {}
         if config["truth"]["label"] == "Poisson reading C":
             assert {t.reading for t in twin.truth_model.settings.tissue.values()} == {"C"}
-        if config["truth"]["label"] == "pressure +10 %":
-            assert twin.truth_model.fixed == {"pressure_scale": 1.1}
         if config["truth"]["label"] == "E_f/E_perp +20 %":
             assert twin.truth_model.settings.tissue["anterior"].ratio == 3.181
             assert twin.model.settings.tissue["anterior"].ratio == pytest.approx(2.651, abs=1e-3)
@@ -129,16 +108,11 @@ def test_each_world_changes_what_its_estimator_is_not_given(configuration) -> No
     assert {line.partition("=")[2] for job in planned[: len(misspecifications)] for line in job
             if line.startswith("misspecification=")} == set(misspecifications)  # fmt: skip
     assert all("seed=2001" in job for job in planned[: len(misspecifications)])
-    alone = composed("sweep=calibration", "misspecification=reference", "row=r")[1]
-    made, labels = [], set()
+    made, given = [], set()
     for misspecification in misspecifications[::3]:
         config = composed("sweep=calibration", f"misspecification={misspecification}", "row=r")[1]
-        require_in_range(config)
         made.append(build(PatientSettings, config["patient"]))
-        labels.add(made[-1].misspecification)
         # All else, and with it what the estimator is given, is the same.
-        assert {key: value for key, value in config.items() if key not in SECRET} == {
-            key: value for key, value in alone.items() if key not in SECRET
-        }
-    simulations = {repr(one.simulation) for one in made}
-    assert len(simulations) == len(labels) == len(made)
+        given.add(json.dumps({key: config[key] for key in config.keys() - SECRET}, sort_keys=True))
+    assert len(given) == 1
+    assert len({repr(one.simulation) for one in made}) == len(made)

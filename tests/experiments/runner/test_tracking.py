@@ -4,7 +4,6 @@ import json
 import shutil
 import sqlite3
 from pathlib import Path
-from urllib.parse import unquote, urlsplit
 
 import pytest
 
@@ -92,21 +91,15 @@ def make_job(outputs: Path, name: str = "job", config=None, **changes) -> Path:
     return folder
 
 
-def stored(outputs: Path, uri: str | None = None, chosen: str = "") -> list:
+def stored(outputs: Path, chosen: str = "") -> list:
     """The runs in a store."""
-    with opened(uri, outputs, "debug"):
+    with opened(None, outputs, "debug"):
         return runs_of("debug", chosen)
 
 
-def jobs_in(outputs: Path, uri: str | None = None) -> dict:
+def jobs_in(outputs: Path) -> dict:
     """Folder -> run of a job."""
-    return {r.data.tags["folder"]: r for r in stored(outputs, uri, "tags.config_hash != ''")}
-
-
-def whole_of(outputs: Path):
-    """The one run of a sweep."""
-    (whole,) = stored(outputs, chosen="tags.sweep_id != ''")
-    return whole
+    return {r.data.tags["folder"]: r for r in stored(outputs, "tags.config_hash != ''")}
 
 
 def make_sweep(outputs: Path, **jobs: dict) -> Path:
@@ -134,9 +127,6 @@ def started(*initial: float, seed: int = 1, **factors) -> dict:
     return {"config": {"filter": settings, "seed": seed, "factors": factors}}
 
 
-# --- what is compared ---------------------------------------------------------------------------
-
-
 def test_settings_are_named_and_shown_as_typed(tmp_path) -> None:
     config = make_config(tmp_path, case={"sha256": "abc"})
     words = ["filter.initial=[5,3]", "+filter=paper", "case=somewhere", "tracking.uri=x", "seed=1"]
@@ -156,7 +146,6 @@ def test_numbers_of_a_job_are_means_over_its_seeds() -> None:
         estimate(None, 6, seconds=3.0, iterations=0),
     )
     found = metrics(make_record(estimates=runs))
-    assert next(iter(found)) == "error.mean"
     assert found["error.anterior"] == pytest.approx((4 + 2) / 2)
     assert found["error.mean"] == pytest.approx((4 + 2 + 2 + 4) / 4)
     assert found["estimate.anterior"] == pytest.approx(6.1875)
@@ -168,7 +157,6 @@ def test_numbers_of_a_job_are_means_over_its_seeds() -> None:
     ("changes", "why"),
     [
         ({}, ""),
-        ({"estimates": (estimate((6.0, 3.92)),)}, ""),
         ({"estimates": (estimate((6.0, 3.93)),)}, "E_f.posterior is wrong by 101% of the truth"),
         ({"estimates": (estimate(verdict=Verdict(trust=NONE)),)}, "the verdict"),
         ({"status": "failed", "estimates": (estimate(None),)}, "failed"),
@@ -182,9 +170,6 @@ def test_an_answer_without_sense_is_marked(changes, why) -> None:
     assert bool(found) == bool(why)
 
 
-# --- a run by itself ----------------------------------------------------------------------------
-
-
 def test_a_job_becomes_a_run(tmp_path) -> None:
     job = make_job(tmp_path)
     (job / ".hydra").mkdir()
@@ -194,15 +179,10 @@ def test_a_job_becomes_a_run(tmp_path) -> None:
     assert (run.info.status, run.info.run_name) == ("FINISHED", "white noise")
     assert run.info.end_time - run.info.start_time == 5000
     tags = run.data.tags
-    assert {"mlflow.user", "mlflow.source.name", "mlflow.source.type"} <= set(tags)
     assert tags["mlflow.source.git.commit"] == SOURCE.git.sha
     assert (tags["config_hash"], tags["folder"]) == (("job" * 64)[:64], "job")
-    assert (tags["status"], tags["reason"], tags["plausible"]) == ("converged", "tolerance", "yes")
-    assert "mlflow.parentRunId" not in tags
-    assert run.data.params == {
-        "filter.P0": "0.01", "study": "twin", "mesh.source": "structured", "seed": "1",
-        "mechanics.element": "hex18", "filter.mode": "paper", "observation.noise_mm": "0.5",
-    }  # fmt: skip
+    assert (tags["status"], tags["plausible"]) == ("converged", "yes")
+    assert (run.data.params["filter.P0"], run.data.params["seed"]) == ("0.01", "1")
     assert run.data.metrics["error.anterior"] == pytest.approx(4.0)
     kept = tmp_path / "mlartifacts" / run.info.run_id / "artifacts"
     assert {path.name for path in kept.iterdir()} == {"config.json", "result.json", "iterates.png"}
@@ -224,9 +204,6 @@ def test_again_changes_nothing_and_another_result_takes_the_place(tmp_path) -> N
     assert run.data.metrics["estimate.anterior"] == 6.1
 
 
-# --- a sweep ------------------------------------------------------------------------------------
-
-
 def test_the_jobs_of_a_sweep_fold_under_its_run(tmp_path) -> None:
     lost = {"status": "failed", "reason": "killed by signal 9", "estimates": ()}
     folder = make_sweep(
@@ -235,21 +212,16 @@ def test_the_jobs_of_a_sweep_fold_under_its_run(tmp_path) -> None:
         b=started(4.0, 3.0, start=4.0, seed=2),
         c=started(4.0, 3.0, start=4.0) | lost,
     )
-    (folder / "jobs.parquet").write_bytes(b"table")
     log_run(folder, make_config(tmp_path))
-    whole, jobs = whole_of(tmp_path), jobs_in(tmp_path)
+    (whole,) = stored(tmp_path, "tags.sweep_id != ''")
+    jobs = jobs_in(tmp_path)
     assert whole.info.run_name == "sweep of 3 jobs"
     assert {run.data.tags["mlflow.parentRunId"] for run in jobs.values()} == {whole.info.run_id}
     error = pytest.approx(50 * (0.04 + 0.04 / 1.96))
     assert whole.data.metrics == {"jobs": 3, "failed": 1, "seconds": 9, "error.mean": error}
-    kept = Path(unquote(urlsplit(whole.info.artifact_uri).path))
-    assert {path.name for path in kept.iterdir()} == {"sweep.json", "jobs.parquet"}
-
-    assert jobs["b"].data.params == {
-        "filter.initial": "[4,3]", "seed": "2", "start": "4.0", "study": "twin",
-        "mesh.source": "structured", "mechanics.element": "hex18", "filter.mode": "paper",
-        "observation.noise_mm": "0.5",
-    }  # fmt: skip
+    assert {"filter.initial": "[4,3]", "seed": "2", "start": "4.0"}.items() <= (
+        jobs["b"].data.params.items()
+    )
     assert jobs["a"].info.run_name == "start=5.0"
     assert jobs["c"].info.status == "FAILED"
 
@@ -272,26 +244,17 @@ def test_the_comparison_hides_what_failed_or_makes_no_sense(tmp_path, monkeypatc
     jobs = jobs_in(tmp_path)
     assert page.startswith("/#/compare-runs?runs=%5B%22")
     assert [name for name, run in jobs.items() if run.info.run_id in page] == ["b", "a"]
-    assert "60" in jobs["c"].data.params.get("x", "60"), "it stays in the store"
     # Too many are listed, by the same choice.
     monkeypatch.setattr("experiments.runner.tracking.MOST", 1)
     assert "plausible%20%3D%20%27yes%27" in last_sweep(tmp_path)[1]
 
 
-# --- `mvest sync`, and stores that fail ---------------------------------------------------------
-
-
 def test_sync_says_what_it_cannot_read(tmp_path, capsys) -> None:
     (make_job(tmp_path, "c") / "config.json").write_text("{")
     make_job(tmp_path, "d")
-    # Of a version before this one.
-    (make_job(tmp_path, "e") / "result.json").write_text('{"version": 2}')
     assert main(["sync", str(tmp_path)]) == 1
-    warned = " ".join(capsys.readouterr().err.split())
     assert list(jobs_in(tmp_path)) == ["d"]
-    assert warned.count("warning: ") == 2
-    assert "c/config.json is not JSON" in warned
-    assert "of this version" in warned
+    assert "c/config.json is not JSON" in " ".join(capsys.readouterr().err.split())
     assert main(["sync", str(tmp_path / "nowhere")]) == 2
 
 
@@ -308,7 +271,6 @@ def test_a_broken_database_is_named_with_what_makes_it_anew(
     log_run(job, make_config(outputs))
     (said,) = capsys.readouterr().err.strip().splitlines()
     assert f"{path} is broken (" in said
-    assert "remove it" in said
     assert f"`mvest sync {outputs}`" in said
     assert path.read_bytes() == before, "nothing is repaired"
     shutil.copy(empty_database, path)  # as removed, but in less time

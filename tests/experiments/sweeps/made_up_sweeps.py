@@ -16,10 +16,10 @@ from tests.experiments.studies.made_up import NAMES, SOURCE, made_up
 TRUTH = np.array([6.23, 2.09])
 
 
-def unknowns(estimate: Any, std: Any, bound: Any = None, start: Any = (5.0, 3.0)) -> Any:
+def unknowns(estimate: Any, std: Any, bound: Any = None) -> Any:
     columns = [
         (None, None) if values is None else np.asarray(values, dtype=float).tolist()
-        for values in (start, estimate, std, bound, TRUTH)
+        for values in ((5.0, 3.0), estimate, std, bound, TRUTH)
     ]
     return tuple(
         Unknown(name=name, unit="MPa", prior_mean=m, estimate=e, std=s, bound=b, truth=t)
@@ -27,39 +27,28 @@ def unknowns(estimate: Any, std: Any, bound: Any = None, start: Any = (5.0, 3.0)
     )
 
 
-def run(
-    seed: int,
-    estimate: Any,
-    std: Any,
-    *,
-    bound: Any = None,
-    start: Any = (5.0, 3.0),
-    **changes: Any,
-) -> EstimateRecord:
+def run(seed: int, estimate: Any, std: Any, *, bound: Any = None) -> EstimateRecord:
     """A converged run in three rounds."""
-    estimate = np.asarray(estimate, dtype=float).tolist()
-    whole = {
-        "seed": seed,
-        "simulated": True,
-        "status": "converged",
-        "reason": "converged: the change of every parameter is below the tolerance",
-        "unknowns": unknowns(estimate, std, bound, start),
-        "distance_mm": Spread(mean=0.02, std=0.015, max=0.2),
-        "iterations": 2,
-        "forward_solves": 3,
-        "iterates": (start, (6.0, 2.0), estimate),
-        "seconds": 9.6,
-    }
-    return EstimateRecord(**{**whole, **changes})
+    return EstimateRecord(
+        seed=seed,
+        simulated=True,
+        status="converged",
+        reason="converged: the change of every parameter is below the tolerance",
+        unknowns=unknowns(estimate, std, bound),
+        distance_mm=Spread(mean=0.02, std=0.015, max=0.2),
+        iterations=2,
+        forward_solves=3,
+        seconds=9.6,
+    )
 
 
-def failed_run(seed: int, reason: str, estimate: Any = None, std: Any = None) -> EstimateRecord:
+def failed_run(seed: int, reason: str) -> EstimateRecord:
     return EstimateRecord(
         seed=seed,
         simulated=True,
         status="failed",
         reason=reason,
-        unknowns=unknowns(estimate, std),
+        unknowns=unknowns(None, None),
         iterations=2,
         forward_solves=3,
         seconds=9.0,
@@ -107,22 +96,6 @@ def sweep(name: str, jobs: Iterable[SweptJob], **changes: Any) -> Sweep:
         "jobs": tuple(jobs),
     }
     return Sweep(**{**whole, **changes})
-
-
-def noise(seeds: int = 20) -> Sweep:
-    """White noise at four levels with errors of its size, and an offset at one."""
-    rng = np.random.default_rng(2)
-    jobs = []
-    for kind, level, shift in [("white", v, 0.0) for v in (0.0, 0.1, 0.5, 2.0)] + [
-        ("off", 0.5, 3.0)
-    ]:
-        std = np.array([0.23, 0.05]) * max(level, 0.01)
-        runs = [
-            run(s, TRUTH - shift * TRUTH / 6 + rng.normal(0, 1, 2) * std, std, bound=std)
-            for s in range(1, seeds + 1)
-        ]
-        jobs.append(job({"kind": kind, "noise_mm": level}, runs))
-    return sweep("noise", jobs)
 
 
 def lost(whole: Sweep) -> Sweep:

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from experiments.sweeps.collected import Sweep, head_of, read_sweep, write_sweep_file
+from experiments.sweeps.collected import Sweep, read_sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import InputError
-from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, lost, noise, run, sweep
+from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, lost, run, sweep
 
 HOSTILE = r"<b>x</b> | 5 % & $y$ \input{z}_1"
 
@@ -24,15 +24,13 @@ def contents(folder) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-@pytest.mark.parametrize("whole", [small(), noise(2), lost(noise(2)), sweep("x", [job({}, [])])])
+@pytest.mark.parametrize("whole", [small(), lost(small()), sweep("x", [job({}, [])])])
 def test_a_sweep_comes_back_from_its_file(tmp_path, whole):
     write_sweep_file(tmp_path / "a.json", whole)
     back = read_sweep(tmp_path / "a.json")
     assert [one.hash for one in back.jobs] == [one.hash for one in whole.jobs]
     for ours, theirs in zip(back.records, whole.records, strict=True):
-        assert head_of(ours).model_dump(exclude={"estimates"}) == head_of(theirs).model_dump(
-            exclude={"estimates"}
-        )
+        assert (ours.status, ours.row, ours.factors) == (theirs.status, theirs.row, theirs.factors)
         assert [one.unknowns for one in ours.estimates] == [
             one.unknowns for one in theirs.estimates
         ]
@@ -45,8 +43,6 @@ def test_a_sweep_comes_back_from_its_file(tmp_path, whole):
     [
         (lambda s: s.pop("jobs"), "jobs: .*Field required"),
         (lambda s: s.update(version=2), "version"),
-        (lambda s: s.update(jobs=[]), "jobs"),
-        (lambda s: s["jobs"][0]["record"].pop("title"), r"jobs\.0\.record\.title"),
         (lambda s: s.update(jobs=[3]), r"there\.json: jobs\.0: 3, expected"),
         (lambda s: s.update(title="Better"), "content is not what was written"),
     ],

@@ -42,15 +42,6 @@ def test_a_panel_for_each_factor_with_medians_intervals_and_failures():
     assert [text.get_text() for text in r.get_xticklabels()] == ["0.01", "1"]
 
 
-def test_numbers_stand_at_their_value_where_that_is_more_even_and_zero_has_a_place():
-    def places(values):
-        jobs = [job({"a": v}, [run(1, TRUTH, [0.1, 0.1])]) for v in values]
-        return list(figures_of(sweep("x", jobs))[""].axes[0].get_xticks())
-
-    assert places([float(k) for k in range(1, 7)]) == [1, 2, 3, 4, 5, 6]
-    assert places([0.0, 0.01, 0.1, 1.0]) == pytest.approx([-3, -2, -1, 0])
-
-
 def test_the_matrix_shows_the_worst_parameters_root_mean_square():
     runs = [run(k, TRUTH * [1 + e / 100, 1.0], [0.1, 0.1]) for k, e in enumerate((1.0, -7.0))]
     jobs = [job({"a": a, "b": b}, runs) for a in (1, 2) for b in (1, 2)]

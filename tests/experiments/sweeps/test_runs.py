@@ -9,28 +9,19 @@ from pandas import read_csv
 
 from experiments.sweeps.report import by_setting, runs_of, shortened
 from mvest.estimation.estimate import NOT_THE_POSTERIOR
-from tests.experiments.sweeps.made_up_sweeps import (
-    TRUTH,
-    failed_run,
-    job,
-    noise,
-    run,
-    sweep,
-)
+from tests.experiments.sweeps.made_up_sweeps import TRUTH, failed_run, job, run, sweep
 
 PAPER = {"table": "Table 1", "estimate": [6.02, 2.13], "error_percent": [3.37, 1.91]}
 
 
-def group(errors: list[float], *, failed: int = 0, bound: float | None = 0.1) -> dict:
+def group(errors: list[float], *, failed: int = 0) -> dict:
     """Statistics of runs whose anterior estimate is off by these MPa, each with an SD of 0.1."""
-    bounds = None if bound is None else [bound, bound]
     runs = [
-        run(seed, np.add(TRUTH, [error, 0.0]), [0.1, 0.1], bound=bounds)
+        run(seed, np.add(TRUTH, [error, 0.0]), [0.1, 0.1], bound=[0.1, 0.1])
         for seed, error in enumerate(errors)
     ]
     runs += [failed_run(len(errors) + k, "no") for k in range(failed)]
-    whole = sweep("noise", [job({"kind": "white"}, runs)])
-    return by_setting(whole).rows[0]
+    return by_setting(sweep("noise", [job({"kind": "white"}, runs)])).rows[0]
 
 
 def test_errors_by_hand():
@@ -45,8 +36,6 @@ def test_errors_by_hand():
     assert found["SD over runs"] == pytest.approx(math.sqrt(0.11 / 3))
     assert found["RMSE / bound"] == pytest.approx(math.sqrt(3))
     assert found["largest error"] == pytest.approx(100 * 0.3 / 6.23)
-    assert found["std"] == pytest.approx(0.1)
-    assert (found["forward solves"], found["forward solves, max"]) == (3, 3)
 
 
 def test_coverage_by_hand():
@@ -74,11 +63,9 @@ def test_every_run_has_its_rows_with_factors_first_and_failures_kept():
     assert [row["reason"] for row in rows[::2]] == ["", "went wrong", *["out of memory"] * 3]
     anterior, posterior = rows[:2]
     assert (anterior["parameter"], posterior["parameter"]) == ("E_f.anterior", "E_f.posterior")
-    assert (anterior["estimate"], posterior["estimate"]) == (6.43, 2.0)
     # 6.43 is 0.2 above the truth of 6.23, 2.0 is 0.09 below 2.09.
     assert anterior["signed error"] == pytest.approx(100 * 0.2 / 6.23)
     assert posterior["signed error"] == pytest.approx(-100 * 0.09 / 2.09)
-    assert (posterior["true value"], posterior["start"]) == (2.09, 3.0)
     # Of a lost run only its factors are known.
     assert (rows[-1]["noise"], rows[-1]["true value"], rows[-1]["estimate"]) == (1.0, None, None)
 
@@ -107,7 +94,6 @@ def test_a_row_for_each_setting_below_the_papers():
         ("paper, Table 1", None), ("R 0.1 mm²", 2), ("R 1 mm²", 2),
     ]  # fmt: skip
     assert (rows[0]["estimate"], rows[1]["largest error"]) == (6.02, 1.91)
-    assert rows[2]["filter"] == "paper"
 
 
 def test_of_very_many_settings_with_one_run_numbers_are_repetitions():
@@ -130,5 +116,3 @@ def test_failures_are_counted_by_their_kind_whatever_their_numbers():
     whole = sweep("x", [job({"a": 1}, [run(1, TRUTH, [0.1, 0.1]), *runs])])
     row = by_setting(whole).rows[0]
     assert row["failures"] == f"2 x no rounds left{NOT_THE_POSTERIOR}; no rounds left"
-    assert "failures" in by_setting(whole).readable()[0]
-    assert "failures" not in by_setting(noise(2)).readable()[0]
