@@ -37,7 +37,7 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     InputError, GeometryError
         The file is damaged or has no points or cells, or cells name points that do not exist.
     """
-    data, groups = _READERS[suffix](path)
+    data, groups = READERS[suffix](path)
     if not data.GetNumberOfPoints():
         raise InputError("damaged or empty: no points, expected a surface")
     if not data.GetNumberOfCells():
@@ -263,7 +263,7 @@ def _glb(path: Path) -> tuple[Any, list[str]]:
     return _of_triangles(np.concatenate(points), np.concatenate(faces)), names
 
 
-_READERS: dict[str, Callable[[Path], tuple[Any, list[str]]]] = {
+READERS: dict[str, Callable[[Path], tuple[Any, list[str]]]] = {
     ".vtk": partial(_vtk, module="vtkIOLegacy", name="vtkGenericDataObjectReader"),
     ".vtp": partial(_vtk, module="vtkIOXML", name="vtkXMLPolyDataReader"),
     ".vtu": partial(_vtk, module="vtkIOXML", name="vtkXMLUnstructuredGridReader"),
@@ -272,3 +272,4 @@ _READERS: dict[str, Callable[[Path], tuple[Any, list[str]]]] = {
     ".ply": _ply,
     ".glb": _glb,
 }
+"""Readers by suffix; each returns VTK's object and the names of groups of its triangles."""

@@ -22,14 +22,14 @@ from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.child import in_child
-from mvest.exchange.mesh_files import polydata, read_cells, vtk_module
+from mvest.exchange.mesh_files import READERS, polydata, read_cells, vtk_module
 from mvest.files import write_atomically
 from mvest.reading.text import MAX_NUMBER, one_line, refusing
 from mvest.typing import FloatArray, IntArray
 
 Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
-SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply", ".vtk", ".glb")
+SURFACE_SUFFIXES = tuple(READERS)
 MERGE_TOLERANCE = 1e-5
 """Merge distance relative to the bounding box diagonal (0.5 µm on 50 mm)."""
 MAX_TRIANGLES = 500_000
