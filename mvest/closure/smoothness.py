@@ -14,7 +14,7 @@ The path then fails if
 
 * the unexplained motion of a vertex exceeds `JUMP_LIMIT`, which is a jump;
 * more than `SLOPE_LIMIT` of a piece's motion is unexplained, and some vertex has more than `SEEN`
-of unexplained motion;
+  of unexplained motion;
 * the unexplained parts add up to more than `SLOPE_LIMIT` of the whole motion, as happens if
   derivatives are wrong everywhere or there are many small jumps;
 * a state's derivative leaves more than `SIDE_LIMIT` unexplained on both sides. At a kink it is
