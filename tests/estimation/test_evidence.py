@@ -191,7 +191,7 @@ def test_intervals_hold_for_errors_other_than_stated(length: float, rough: float
     if rough:
         assert learned.quantities[-1].learned.median == pytest.approx(rough, rel=0.1)
         # What is left is as large as expected.
-        assert np.mean(nis) == pytest.approx(1.0, abs=0.02)
+        assert np.mean(nis) == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize(

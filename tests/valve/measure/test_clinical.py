@@ -119,8 +119,8 @@ def test_ratios_lengths_and_tips(quick):
     )
     assert found["tip_separation_mm"] == pytest.approx(2 * p.papillary.tip[0])
     # The longest way from annulus to edge, in the middle of each leaflet.
-    assert found["anterior_length_mm"] == pytest.approx(p.leaflets.anterior.length, rel=0.1)
-    assert found["posterior_length_mm"] == pytest.approx(p.leaflets.posterior.length, rel=0.1)
+    assert found["anterior_length_mm"] == pytest.approx(p.leaflets.anterior.length, rel=0.05)
+    assert found["posterior_length_mm"] == pytest.approx(p.leaflets.posterior.length, rel=0.05)
     vertices, surface, annulus = dome(-6.0)
     found = clinical_measurements(
         vertices, surface, annulus, TIPS, 1.0, tip_names=("tip_0", "tip_180")
