@@ -150,9 +150,9 @@ def test_remesh(cylinder, leaflets, wanted):
     assert quality.mean() > 0.8
     outward = surface.normals[:, :2] * surface.vertices[:, :2]
     assert np.all(outward.sum(axis=1) > 0)
-    # Areas of the leaflets are as 1 : 2 : 3, within half an edge on both sides.
+    # Areas of the leaflets are as 1 : 2 : 3.
     share = np.bincount(surface.region, area) / area.sum()
-    assert share == pytest.approx(np.array([1, 2, 3]) / 6, abs=0.06)
+    assert share == pytest.approx(np.array([1, 2, 3]) / 6, abs=0.005)
 
 
 @pytest.mark.parametrize(
