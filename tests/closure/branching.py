@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-LOW, HIGH = 0.45, 0.7
+LOW, HIGH = 0.4, 0.6
 """Where the chordae branch, over the length from tip to leaflet."""
-SLACK = 1.1
+SLACK = 1.08
 """Least rest length over the length in the open valve, to the insertion. The patch around it, which
 the chord pulls at, has its centre up to 0.4 mm nearer to the annulus."""
 
