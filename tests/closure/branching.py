@@ -6,7 +6,7 @@ import numpy as np
 
 LOW, HIGH = 0.4, 0.6
 """Where the chordae branch, over the length from tip to leaflet."""
-SLACK = 1.08
+SLACK = 1.1
 """Least rest length over the length in the open valve, to the insertion. The patch around it, which
 the chord pulls at, has its centre up to 0.4 mm nearer to the annulus."""
 
