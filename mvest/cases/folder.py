@@ -90,7 +90,7 @@ def read_case(path: Path | str) -> ValveCase:
     if not folder.case.is_file():
         raise InputError(f"{folder.root}: no {CASE_FILE} in this folder")
     document = folder.document
-    check_different("regions", list(document.regions.values()), folder.wrong)
+    check_different("regions", document.region_names, folder.wrong)
     check_frames(document.frames, folder.wrong)
     seen = [read_frame(folder, number) for number in range(len(document.frames))]
     first = next(s for s in seen if s.entry.role == Role.REFERENCE)

@@ -59,7 +59,7 @@ SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
 
 def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface:
     """The midsurface of the reference frame; assumptions are added to ``derived``."""
-    seen, names = reference.seen, tuple(folder.document.regions.values())
+    seen, names = reference.seen, folder.document.region_names
     n = len(seen.vertices)
     shape = seen.vertices, seen.triangles, reference.region, names
     bare = LeafletSurface(*shape, np.tile([1.0, 0.0, 0.0], (n, 1)), np.ones(n))
@@ -170,7 +170,7 @@ def read_chordae(
 def _laid_out(
     folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
 ) -> Chordae:
-    names = list(folder.document.regions.values())
+    names = folder.document.region_names
     seen = reference.seen
     if len(names) != 2 or "anterior" not in names or len(seen.tips) != 2:
         raise InputError(

@@ -229,3 +229,51 @@ def folder_with(tmp_path, **arrays):
 def test_a_file_of_other_samples_is_refused(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
         read_case(folder_with(tmp_path, **{**GOOD, **change}))
+
+
+# --- several segments of a leaflet --------------------------------------------------------------
+
+
+def scallops(case):
+    """Label of each triangle: 0 anterior; 1, 2 and 3 in three parts of the posterior leaflet."""
+    surface = case.surface
+    middle = surface.vertices[surface.triangles].mean(axis=1)
+    angle = np.degrees(np.arctan2(middle[:, 0], -middle[:, 1]))
+    return np.where(surface.region == 0, 0, 2 + (angle > 30.0) - (angle < -30.0))
+
+
+def test_segments_of_a_leaflet_are_one_region(tmp_path):
+    document = plain_folder(tmp_path)
+    whole = read_case(save(tmp_path, document))
+    label = scallops(whole)
+    assert set(label.tolist()) == {0, 1, 2, 3}
+    for entry, frame in zip(document["frames"], whole.frames, strict=True):
+        save_surface(tmp_path / entry["surface"], frame.vertices, frame.triangles, label)
+        for number in range(4):
+            file = tmp_path / f"{entry['name']}{number}.vtp"
+            save_surface(file, frame.vertices, frame.triangles[label == number], None)
+    document["regions"] = {0: "anterior", **dict.fromkeys((1, 2, 3), "posterior")}
+    labelled = read_case(save(tmp_path, document))
+    assert_equal(labelled, whole, "sha256")
+    for entry in document["frames"]:
+        files = [f"{entry['name']}{number}.vtp" for number in range(4)]
+        entry["surface"] = {"anterior": files[0], "posterior": files[1:]}
+    document["regions"] = ["anterior", "posterior"]
+    joined = read_case(save(tmp_path, document))
+    assert joined.surface.region_names == ("anterior", "posterior")
+    assert len(joined.surface.vertices) == len(whole.surface.vertices)
+    assert joined.closed.corresponds
+    # The same triangles of the same regions; merging numbers them anew.
+    for one in (0, 1):
+        corners = [
+            np.sort(s.vertices[s.triangles[s.region == one]].mean(axis=1), axis=0)
+            for s in (joined.surface, whole.surface)
+        ]
+        np.testing.assert_allclose(*corners, atol=1e-12)
+    # Each may be a region of its own.
+    regions = ["anterior", "P1", "P2", "P3"]
+    for entry in document["frames"]:
+        entry["surface"] = f"{entry['name']}.vtp"
+    document |= {"regions": regions, "thickness": 1.3}
+    own = read_case(save(tmp_path, document))
+    np.testing.assert_array_equal(own.surface.region, label)
