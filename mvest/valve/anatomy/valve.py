@@ -7,13 +7,13 @@ failed check names the field and the entry.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import area_vectors, area_vectors_change, areas
 
@@ -36,18 +36,19 @@ def checked_floats(name: str, array: FloatArray, shape: tuple[int | None, ...]) 
 
 
 def checked_indices(
-    name: str, array: IntArray, upper: int, shape: tuple[int | None, ...]
+    name: str, array: IntArray, upper: int, shape: tuple[int | None, ...], lower: int = 0
 ) -> IntArray:
-    """A read-only copy as int64; InputError on a wrong shape or type, or outside [0, upper)."""
+    """A read-only copy as int64; InputError on a wrong shape or type, or outside [lower, upper)."""
     given = np.asarray(array)
     if given.size and not np.issubdtype(given.dtype, np.integer):
         raise InputError(f"{name}: {given.dtype}, expected integers")
     result = np.array(given, dtype=np.int64, order="C")
     _check_shape(name, result.shape, shape)
-    bad = np.argwhere((result < 0) | (result >= upper))
+    bad = np.argwhere((result < lower) | (result >= upper))
     if bad.size:
         where = tuple(int(i) for i in bad[0])
-        raise InputError(f"{name}: entry {where} is {result[where]}, expected 0 to {upper - 1}")
+        found = f"entry {where} is {result[where]}, expected {lower} to {upper - 1}"
+        raise InputError(f"{name}: {found}")
     result.setflags(write=False)
     return result
 
@@ -173,34 +174,120 @@ class LeafletSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chordae:
-    """Chordae tendineae: straight cables from a papillary tip to a point of the leaflets."""
+    """Chordae tendineae: cables from the papillary tips to the leaflets, which may branch.
 
-    tip: IntArray  #: ``(c,)`` index of the papillary tip
-    insertion: FloatArray  #: ``(c, 3)`` mm, insertion on the midsurface in the reference frame
-    family: IntArray  #: ``(c,)`` index into ``family_names`` (marginal, basal, ...)
+    The k = c + j segments form trees, each rooted at a papillary tip. Segment i < c ends at
+    insertion i, segment c + i at junction i. Straight chordae have no junctions.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, values that are not finite or not positive, unknown families or parents, or
+        segments that form no trees.
+    """
+
+    tip: IntArray  #: ``(k,)`` index of the papillary tip at the root
+    insertion: FloatArray  #: ``(c, 3)`` mm, leaflet ends on the midsurface in the reference frame
+    family: IntArray  #: ``(k,)`` index into ``family_names`` (marginal, basal, ...)
     family_names: tuple[str, ...]
-    rest_length: FloatArray  #: (c,) mm
-    axial_stiffness: FloatArray  #: ``(c,)`` N, Young's modulus times cross section
+    rest_length: FloatArray  #: (k,) mm
+    axial_stiffness: FloatArray  #: ``(k,)`` N, Young's modulus times cross section
     toe_strain: float  #: strain over which the stiffness rises from zero to ``axial_stiffness``
+    #: ``(j, 3)`` mm, points at which chordae branch, in the reference frame
+    junction: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    #: ``(k,)`` junction at which each segment starts, or -1 at the tip; if empty, all start there
+    parent: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
         set_(self, "insertion", checked_floats("chordae insertion", self.insertion, (None, 3)))
-        c = len(self.insertion)
-        set_(self, "tip", checked_indices("chordae tip", self.tip, np.iinfo(np.int64).max, (c,)))
+        set_(self, "junction", checked_floats("chordae junction", self.junction, (None, 3)))
+        c, j = len(self.insertion), len(self.junction)
+        k = c + j
+        set_(self, "tip", checked_indices("chordae tip", self.tip, np.iinfo(np.int64).max, (k,)))
         n_families = len(self.family_names)
-        set_(self, "family", checked_indices("chordae family", self.family, n_families, (c,)))
+        set_(self, "family", checked_indices("chordae family", self.family, n_families, (k,)))
         for name in ("rest_length", "axial_stiffness"):
-            value = checked_floats(f"chordae {name}", getattr(self, name), (c,))
+            value = checked_floats(f"chordae {name}", getattr(self, name), (k,))
             if np.any(value <= 0):
                 i = int(np.argmin(value))
                 raise InputError(f"{name} of chord {i} is {value[i]}, expected > 0")
             set_(self, name, value)
         if not 0 < self.toe_strain < 0.5:
             raise InputError(f"toe strain {self.toe_strain}, expected between 0 and 0.5")
+        parent = self.parent if len(self.parent) or j else np.full(k, -1)
+        parent = checked_indices("chordae parent", parent, j, (k,), lower=-1)
+        set_(self, "parent", parent)
+        barren = np.setdiff1d(np.arange(j), parent)
+        if barren.size:
+            raise InputError(f"chordae junction {barren[0]}: no segment starts at it")
+        paths(parent, c)  # checks that there is no cycle
+        other = np.flatnonzero((parent >= 0) & (self.tip != self.tip[c + parent]))
+        if other.size:
+            i = int(other[0])
+            raise InputError(
+                f"chordae tip: segment {i} belongs to tip {self.tip[i]}, but starts at junction "
+                f"{parent[i]} of tip {self.tip[c + parent[i]]}"
+            )
 
     def __len__(self) -> int:
-        return len(self.insertion)
+        return len(self.tip)
+
+    @property
+    def paths(self) -> BoolArray:
+        """See `paths`."""
+        return paths(self.parent, len(self.insertion))
+
+    def ends(self, tips: FloatArray) -> FloatArray:
+        """Start and end ``(k, 2, 3)`` mm of each segment, with the papillary tips ``(t, 3)``."""
+        points = np.concatenate([self.insertion, self.junction])
+        branches = (self.parent >= 0)[:, None]
+        start = np.where(branches, points[self.parent + len(self.insertion)], tips[self.tip])
+        return np.stack([start, points], axis=1)
+
+    def moved(self, tips: FloatArray, ends: FloatArray) -> Chordae:
+        """The chordae with other tips and leaflet ends; their junctions follow proportionally.
+
+        A junction moves with its tip and the mean of the leaflet ends beyond it, each weighted by
+        the length of the chord on the other side.
+
+        Parameters
+        ----------
+        tips, ends : (t, 3) and (c, 3) mm
+            Displacements of the papillary tips and of the insertions.
+        """
+        weights = leverage(self.parent, self.rest_length, len(self.insertion))
+        held = (1 - weights.sum(axis=1, keepdims=True)) * tips[self.tip[len(self.insertion) :]]
+        junction = self.junction + held + weights @ ends
+        return replace(self, insertion=self.insertion + ends, junction=junction)
+
+
+def paths(parent: IntArray, c: int) -> BoolArray:
+    """Whether segment (row) or its trunk contains a segment (column), ``(k, k)``.
+
+    A row has the segments on the way from the tip to the segment's end. ``parent (k,)`` and c are
+    those of `Chordae`; InputError if segments form a cycle.
+    """
+    out = np.eye(len(parent), dtype=np.bool_)
+    at = np.where(parent >= 0, c + parent, -1)
+    for _ in parent:
+        on = np.flatnonzero(at >= 0)
+        if not on.size:
+            return out
+        out[on, at[on]] = True
+        at[on] = np.where(parent[at[on]] >= 0, c + parent[at[on]], -1)
+    looped = np.flatnonzero(at >= 0)
+    if looped.size:
+        raise InputError(f"chordae parent: segment {looped[0]} hangs on a cycle of junctions")
+    return out
+
+
+def leverage(parent: IntArray, rest_length: FloatArray, c: int) -> FloatArray:
+    """Share ``(j, c)`` of each leaflet end's displacement that `Chordae.moved` gives a junction."""
+    on = paths(parent, c)
+    length = on @ rest_length
+    beyond = on[:c, c:].T / on[:c, c:].sum(axis=0)[:, None]
+    return np.asarray(beyond * (length[c:] / (beyond @ length[:c]))[:, None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
