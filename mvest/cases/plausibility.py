@@ -46,8 +46,8 @@ RANGES = {
          "myxomatous valves"),
         ("open_orifice", 50.0, 900.0, "mm²", "4 to 6 cm² in adults; below 1 cm² is severe "
          "stenosis, no model's valve"),
-        ("chord_length", 3.0, 45.0, "mm", "10 to 25 mm from papillary tip to insertion; branches "
-         "are shorter"),
+        ("chord_length", 3.0, 45.0, "mm", "10 to 25 mm from papillary tip to insertion, along its "
+         "branches"),
         ("thickness", 0.3, 3.5, "mm", "1.2 to 1.3 mm in the paper, 5 mm at the rough edge of "
          "myxomatous leaflets"),
         ("closing_pressure", 60.0, 200.0, "mmHg", "left ventricular systolic less left atrial "
@@ -123,8 +123,9 @@ def _anatomy(case: ValveCase) -> Iterator[Value]:
     low, high, *_ = RANGES["thickness"]
     hint = "is it in cm?" if low <= 10 * typical <= high else ""
     yield "thickness", "the leaflets' typical thickness", typical, "thickness", hint
-    tips = reference.papillary_tips[case.chordae.tip]
-    length = np.linalg.norm(case.chordae.insertion - tips, axis=1)
+    chordae = case.chordae
+    segments = np.linalg.norm(np.diff(chordae.ends(reference.papillary_tips), axis=1)[:, 0], axis=1)
+    length = (chordae.paths @ segments)[: len(chordae.insertion)]
     for what, extreme in (("shortest", min), ("longest", max)) if len(length) else ():
         yield "chordae", f"the length of the {what} chord", extreme(length), "chord_length", ""
     for frame in case.frames:
@@ -201,9 +202,12 @@ def _closing(case: ValveCase, closed: Frame) -> Iterator[Value]:
             yield field, what, stretch, "stretch", "do its vertices correspond?"
     if closed.corresponds and len(chordae):
         _, at = cKDTree(surface.vertices).query(chordae.insertion)
-        length = np.linalg.norm(closed.vertices[at] - closed.papillary_tips[chordae.tip], axis=1)
-        # Quantiles, because noise moves the ends of single chords.
-        tight, middle = np.quantile(length / chordae.rest_length - 1.0, [0.9, 0.5])
+        tips = closed.papillary_tips[chordae.tip[: len(at)]]
+        length = np.linalg.norm(closed.vertices[at] - tips, axis=1)
+        rest = (chordae.paths @ chordae.rest_length)[: len(at)]
+        # Quantiles, because noise moves the ends of single chords. A branching chord is at least as
+        # strained as if it were straight.
+        tight, middle = np.quantile(length / rest - 1.0, [0.9, 0.5])
         too_tight = tight > RANGES["chord_strain"].high
         share, strain = ("a tenth", tight) if too_tight else ("half", middle)
         what = f"the strain that {share} of the chordae exceed"

@@ -100,7 +100,10 @@ class FrameEntry(_Model):
 class ChordaeEntry(_Model):
     """The table of chordae, and their common properties."""
 
-    file: Name = Field(description="a .csv file with tip,x,y,z,family,rest_length_mm,stiffness_n")
+    file: Name = Field(
+        description="a .csv file with tip,x,y,z,family,rest_length_mm,stiffness_n, and start,end "
+        "if chordae branch"
+    )
     toe_strain: Number = Field(
         0.015, gt=0, lt=0.5, description="strain over which the stiffness rises, in (0, 0.5)"
     )

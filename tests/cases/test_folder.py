@@ -14,7 +14,7 @@ from mvest.cases.folder import (
 from mvest.errors import InputError
 from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.triangles import unit_rows
-from tests.cases.folders import TIPS, plain_folder, save, save_surface, template_case
+from tests.cases.folders import TIPS, plain_folder, save, save_surface, template_case, tree_case
 
 
 def assert_equal(back, expected, *leave_out):
@@ -38,8 +38,8 @@ def assert_equal(back, expected, *leave_out):
             assert a == b, entry.name
 
 
-def test_a_case_comes_back_as_it_was_written(tmp_path):
-    case = template_case()
+@pytest.mark.parametrize("case", [template_case(), tree_case()], ids=["straight", "trees"])
+def test_a_case_comes_back_as_it_was_written(tmp_path, case):
     back = read_case(write_case(tmp_path / "case", case))
     assert_equal(back, case, "sha256")
     assert [path.name for path in tmp_path.iterdir()] == ["case"]
@@ -47,6 +47,23 @@ def test_a_case_comes_back_as_it_was_written(tmp_path):
     assert_equal(again, back, "sha256")  # the last digit of a fibre may differ
     assert len(back.sha256) == 64
     assert back.valve.motion.annulus.shape == (2, 40, 3)
+    header = (tmp_path / "case" / "chordae.csv").read_text().splitlines()[0]
+    assert header.endswith("stiffness_n,start,end") is bool(len(case.chordae.junction))
+
+
+def test_rows_of_branching_chordae_may_have_any_order_and_names(tmp_path):
+    case = tree_case()
+    folder = write_case(tmp_path / "case", case)
+    file = folder / "chordae.csv"
+    head, *rows = file.read_text().splitlines()
+    names = dict(zip(("b0", "b1", "b2"), ("trunk of A2", "left", "right"), strict=True))
+    turned = [",".join(names.get(cell, cell) for cell in row.split(",")) for row in rows[::-1]]
+    file.write_text("\n".join([head, *turned]))
+    back, c = read_case(folder).chordae, len(case.chordae.insertion)
+    order = np.r_[np.arange(c)[::-1], c + np.arange(3)[::-1]]
+    np.testing.assert_array_equal(back.rest_length, case.chordae.rest_length[order])
+    tips = case.frames[0].papillary_tips
+    np.testing.assert_array_equal(back.ends(tips), case.chordae.ends(tips)[order])
 
 
 def test_nothing_is_left_of_a_case_that_cannot_be_written(tmp_path):
