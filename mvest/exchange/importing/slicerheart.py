@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import InputError
-from mvest.exchange.importing.joining import EDGE_MM, Leaflet, commissures_on, joined
+from mvest.exchange.importing.joining import EDGE_MM, Leaflet, commissures_on, joined, united
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
 from mvest.exchange.importing.written import (
     REGIONS,
@@ -237,9 +237,9 @@ def _placed(
     The annulus must be close to the leaflets, and landmarks must not be mirrored.
     """
     leaflets, marks = [], seen.landmarks
-    for name, (vertices, triangles) in zip(REGIONS, seen.leaflets, strict=True):
+    for name, segments in zip(REGIONS, seen.leaflets, strict=True):
         with named(f"{name} leaflet"):
-            leaflets.append(Leaflet.of(vertices, triangles))
+            leaflets.append(united([Leaflet.of(*segment) for segment in segments]))
         if leaflets[-1].holes:
             notes.append(f"{name} leaflet: {leaflets[-1].holes} holes closed")
     edges = np.concatenate([leaflet.curve for leaflet in leaflets])

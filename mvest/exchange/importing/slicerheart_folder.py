@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.exchange.importing.leaflet_parts import SCALLOPS, WORDS
 from mvest.exchange.importing.written import REGIONS
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
 from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
@@ -44,7 +45,6 @@ _NAME = re.compile(
 )
 _PHASE = re.compile(r"(?:.*[^A-Za-z0-9])?(?P<phase>[MEC][DS])(?:[^A-Za-z0-9].*)?")
 """Phases in other names, where CT is a modality and P1 a scallop."""
-LEAFLETS = {"anterior": {"anterior", "aml", "amvl"}, "posterior": {"posterior", "pml", "pmvl"}}
 MUSCLES = (
     ({"antero", "lateral"}, {"anterolateral"}, {"al"}),
     ({"postero", "medial"}, {"posteromedial"}, {"pm"}),
@@ -81,7 +81,9 @@ class _File:
             found.get(key, "") for key in ("scene", "valve", "frame", "phase", "again")
         )
         self.words = words_of(found.get("rest", stem))
-        named = [name for name, words in LEAFLETS.items() if words & self.words]
+        # A scallop is one word here, as in "P2" or "posterior leaflet P2".
+        self.segment = set(re.findall(r"[a-z]+\d*", found.get("rest", stem).lower())) & SCALLOPS
+        named = [name for name, words in WORDS.items() if words & (self.words | self.segment)]
         self.leaflet = "" if len(named) != 1 or self.words & NO_LEAFLET else named[0]
 
     def fits(self, other: _File) -> bool:
@@ -96,7 +98,8 @@ class SeenPhase:
     """One valve in one phase; ``notes`` lists assumptions and unused data."""
 
     phase: str  # key of `PHASES`; empty if the export names none
-    leaflets: tuple[tuple[FloatArray, IntArray], ...]  # anterior, posterior: (n, 3) mm, (m, 3)
+    #: segments of the anterior and of the posterior leaflet: (n, 3) mm, (m, 3)
+    leaflets: tuple[tuple[tuple[FloatArray, IntArray], ...], ...]
     contour: FloatArray | None  # (k, 3) mm, closed curve along the annulus
     landmarks: dict[str, FloatArray]  # (3,) mm by label, of `LANDMARKS`
     tips: FloatArray | None  # (2, 3) mm, antero-lateral and postero-medial
@@ -199,23 +202,28 @@ def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> 
 
 def _leaflet(
     folder: Path, files: Sequence[_File], name: str, notes: list[str]
-) -> tuple[FloatArray, IntArray]:
-    """The surface of a leaflet; atrial sides and fitted shells come first."""
+) -> tuple[tuple[FloatArray, IntArray], ...]:
+    """The segments of a leaflet, mostly one; atrial sides and fitted shells come first."""
     fitting = [f for f in files if f.leaflet == name]
     for better in ("atrial", "fit"):
         fitting = [f for f in fitting if better in f.words] or fitting
     # Further valve models of a frame have a number after the phase.
     fitting = [f for f in fitting if not f.again] or fitting
-    if len(fitting) != 1:
+    segments = [f.segment for f in fitting]
+    apart = all(segments) and len(set().union(*segments)) == sum(map(len, segments))
+    if len(fitting) != 1 and not (fitting and apart):
         listed = one_line(", ".join(f.path.name for f in fitting or files), 150)
         raise InputError(
-            f"{folder}: {len(fitting)} surfaces of the {name} leaflet ({listed}), expected one; "
-            "only=WORD takes those with a word in their names"
+            f"{folder}: {len(fitting)} surfaces of the {name} leaflet ({listed}), expected one, or "
+            "one of each scallop (P1, P2, ...); only=WORD takes those with a word in their names"
         )
-    surface = read_surface(fitting[0].path)
-    if surface.space is None:
+    if apart:
+        listed = ", ".join(sorted(segment.upper() for own in segments for segment in own))
+        notes.append(f"{name} leaflet: {listed}")
+    surfaces = [read_surface(f.path) for f in fitting]
+    if any(surface.space is None for surface in surfaces):
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
-    return surface.vertices * TO_LPS[surface.space or "RAS"], surface.triangles
+    return tuple((s.vertices * TO_LPS[s.space or "RAS"], s.triangles) for s in surfaces)
 
 
 def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:

@@ -139,6 +139,50 @@ def test_folders_without_phases_are_the_open_and_the_closed_frame(folder, case, 
     refused(tmp_path / "MS", "are the frames exchanged?", options=options)
 
 
+def in_scallops(folder, gap_mm):
+    """Cut the posterior leaflets into P1, P2 and P3, with triangles of their own and a gap."""
+    for file in folder.glob("*_atrial_mitral_posterior_leaflet.vtk"):
+        whole = pyvista.read(file)
+        along = (whole.points - whole.points.mean(axis=0)) @ POSE[:, 0]
+        low, high = np.quantile(along, [0.35, 0.65])
+        name = file.name.replace("posterior_leaflet", "posterior_leaflet_P{}")
+        for number, (start, end) in enumerate(((-99, low), (low, high), (high, 99)), 1):
+            whole.point_data["side"] = np.abs(along - (start + end) / 2) - (end - start) / 2
+            part = whole.clip_scalar(scalars="side", value=-gap_mm / 2).triangulate().clean()
+            if number == 2:
+                part = part.subdivide(1, "linear").flip_faces()
+            write_model(part, folder / name.format(number))
+        file.unlink()
+
+
+def write_model(model, file):
+    model.clear_data()
+    model.save(file)
+    file.write_bytes(
+        re.sub(rb"\n[^\n]*\n", b"\n3D Slicer. SPACE=LPS\n", file.read_bytes(), count=1)
+    )
+
+
+def test_scallops_of_the_posterior_leaflet_are_joined(folder, case):
+    in_scallops(folder, 0.6)
+    found = import_slicerheart(folder, OPTIONS)
+    for frame, expected in zip(found.frames, case.frames, strict=True):
+        assert rms_to(frame, expected.vertices, expected.triangles) < 0.1
+    own, true = (
+        np.bincount(s.region, areas(s.vertices, s.triangles)) for s in (found.surface, case.surface)
+    )
+    assert own == pytest.approx(true, rel=0.01)
+    assert "MD: posterior leaflet: P1, P2, P3" in found.derived
+    file = next(folder.glob("*_MD_*_P2.vtk"))
+    shutil.copy(file, file.with_stem(f"{file.stem}_again"))
+    refused(folder, "4 surfaces of the posterior .*, or one of each scallop")
+
+
+def test_scallops_far_apart_are_refused(folder):
+    in_scallops(folder, 4.0)
+    refused(folder, "MD: posterior leaflet: segments of a leaflet, 4.* mm apart", GeometryError)
+
+
 def test_the_atrial_side_is_taken_before_closed_segments(folder, case):
     for file in folder.glob("*_atrial_*"):
         SPHERE.save(file.with_name(file.name.replace("_atrial", "")))
