@@ -58,6 +58,8 @@ class Surface:
     others
         Number of cells of each other type, by VTK name ("tetra", "wedge"); single vertices are
         not counted.
+    lines
+        ``(k, 2)`` ends of the line segments of the file.
     space
         "LPS" or "RAS" if 3D Slicer named the axes in a title, comment or field data; else None.
     """
@@ -70,10 +72,11 @@ class Surface:
     region: IntArray | None = None
     others: Mapping[str, int] = field(default_factory=dict)
     space: str | None = None
+    lines: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
 
 def read_mesh(path: Path | str) -> Surface:
-    """Read the points and triangles of a file.
+    """Read the points, triangles and lines of a file.
 
     Raises
     ------
@@ -201,6 +204,7 @@ def merged(surface: Surface) -> Surface:
         surface,
         vertices=surface.vertices[keep],
         triangles=rank[inverse].reshape(-1, 3),
+        lines=surface.lines[:0],
         point_data={name: values[keep] for name, values in surface.point_data.items()},
     )
 

@@ -22,7 +22,7 @@ from mvest.errors import InputError
 from mvest.exchange.importing.leaflet_parts import SCALLOPS, WORDS
 from mvest.exchange.importing.written import REGIONS
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
-from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_mesh, read_surface
 from mvest.reading.text import numbers, one_line, read_columns
 from mvest.typing import FloatArray, IntArray
 
@@ -52,7 +52,8 @@ MUSCLES = (
 """Words for the papillary muscles, in the order of a case's tips."""
 PAPILLARY = {"papillary", "muscle", "muscles", "tip", "tips"}
 ANNULUS, MARKS = {"annulus"}, {"landmarks", "labels"}
-NO_LEAFLET = PAPILLARY | ANNULUS | {"ventricular", "chords", "chordae"}
+CHORDS = {"chords", "chordae"}
+NO_LEAFLET = PAPILLARY | ANNULUS | CHORDS | {"ventricular"}
 LANDMARKS = ("A", "P", "AL", "PM", "ALC", "PMC")
 _COMMON = ("Filename", "Phase", "FrameNumber", "Valve")
 _TABLES = {
@@ -103,6 +104,7 @@ class SeenPhase:
     contour: FloatArray | None  # (k, 3) mm, closed curve along the annulus
     landmarks: dict[str, FloatArray]  # (3,) mm by label, of `LANDMARKS`
     tips: FloatArray | None  # (2, 3) mm, antero-lateral and postero-medial
+    chords: FloatArray  # (k, 2, 3) mm, segments from the tips to the leaflets
     notes: tuple[str, ...]
 
 
@@ -144,7 +146,7 @@ def read_folder(
         )
     phases = [phase for phase in PHASES if any(f.phase == phase for f in chosen)]
     seen = {
-        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], lists)
+        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], models, lists)
         for phase in phases or [""]
     }
     if phases and not all(f.phase for f in chosen):
@@ -154,7 +156,9 @@ def read_folder(
     return seen
 
 
-def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> SeenPhase:
+def _read_phase(
+    folder: Path, mine: Sequence[_File], models: Sequence[_File], lists: Sequence[_File]
+) -> SeenPhase:
     """Read one phase from its leaflet surfaces."""
     notes: list[str] = []
     this = min(mine, key=lambda f: int(f.frame or -1))
@@ -187,6 +191,10 @@ def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> 
                 notes.append(f"{item.kind} of {len(item.labels)} points ({listed}) not used")
             if item.unplaced:
                 notes.append(f"points {', '.join(item.unplaced)} not placed, so not used")
+    chords = [np.zeros((0, 2, 3))]
+    for file in (f for f in models if f.words & CHORDS and f.phase == this.phase and f.fits(this)):
+        drawn = read_mesh(file.path)
+        chords.append((drawn.vertices * TO_LPS[drawn.space or "RAS"])[drawn.lines])
     known = {label.strip().upper(): point for label, point in landmarks.items()}
     if unused := known.keys() - {"", *LANDMARKS}:
         notes.append(f"landmarks {', '.join(sorted(unused))} not used")
@@ -196,6 +204,7 @@ def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> 
         next((curve for curve in curves if len(curve) >= MIN_CONTOUR), None),
         {label: known[label] for label in LANDMARKS if label in known},
         np.stack([tips[k] for k in range(2)]) if len(tips) == 2 else None,
+        np.concatenate(chords),
         tuple(dict.fromkeys(one_line(note) for note in notes)),
     )
 
@@ -209,7 +218,7 @@ def _leaflet(
         fitting = [f for f in fitting if better in f.words] or fitting
     # Further valve models of a frame have a number after the phase.
     fitting = [f for f in fitting if not f.again] or fitting
-    segments = [f.segment for f in fitting]
+    segments = [f.segment - {"scallop"} or f.segment and {f.path.stem} for f in fitting]
     apart = all(segments) and len(set().union(*segments)) == sum(map(len, segments))
     if len(fitting) != 1 and not (fitting and apart):
         listed = one_line(", ".join(f.path.name for f in fitting or files), 150)
