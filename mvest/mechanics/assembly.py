@@ -79,12 +79,13 @@ class SparsityPattern:
         """Column ``(u + s,)`` of each block."""
         return np.concatenate([self.columns, self.skew[:, 1]])
 
-    def within(self, nodes: IntArray) -> Positions:
+    def within(self, nodes: IntArray, others: IntArray | None = None) -> Positions:
         """Positions ``(g, k, k)`` of the blocks between the nodes ``(g, k)`` of each group.
 
-        -1 in the lower triangle. All blocks must be in the pattern.
+        With ``others (g, m)`` the blocks ``(g, k, m)`` of these columns. -1 in the lower triangle.
+        All blocks must be in the pattern.
         """
-        return _within(self.pointer, self.columns, nodes)
+        return _within(self.pointer, self.columns, nodes, nodes if others is None else others)
 
     def between(self, first: IntArray, second: IntArray) -> Positions:
         """Positions ``(g, k, k)`` of the blocks that couple nodes ``(g, k)`` with others.
@@ -226,14 +227,13 @@ def _find(pointer: Positions, columns: Positions, row: int, column: int) -> int:
 
 
 @nb.njit(cache=True)
-def _within(pointer: Positions, columns: Positions, nodes: IntArray) -> Positions:
-    g, k = nodes.shape
-    out = np.full((g, k, k), -1, dtype=np.int32)
-    for e in range(g):
-        for a in range(k):
-            for b in range(k):
-                if nodes[e, a] <= nodes[e, b]:
-                    out[e, a, b] = _find(pointer, columns, nodes[e, a], nodes[e, b])
+def _within(pointer: Positions, columns: Positions, nodes: IntArray, others: IntArray) -> Positions:
+    out = np.full((*nodes.shape, others.shape[1]), -1, dtype=np.int32)
+    for e in range(out.shape[0]):
+        for a in range(out.shape[1]):
+            for b in range(out.shape[2]):
+                if nodes[e, a] <= others[e, b]:
+                    out[e, a, b] = _find(pointer, columns, nodes[e, a], others[e, b])
     return out
 
 
@@ -301,15 +301,23 @@ def add_forces_at(out: FloatArray, points: Embedding, force: FloatArray) -> None
 
 @nb.njit(cache=True)
 def scatter_blocks(
-    data: FloatArray, positions: Positions, weights: FloatArray, blocks: FloatArray
+    data: FloatArray,
+    positions: Positions,
+    rows: FloatArray,
+    columns: FloatArray,
+    blocks: FloatArray,
 ) -> None:
-    """Add ``w_a w_b block`` to the data for points ``(k, w)`` with one symmetric block each."""
+    """Add ``w_a v_b block`` to the data, for weights w in ``rows (g, k)`` and v in ``columns``.
+
+    Blocks ``(g, 3, 3)`` couple two points each. Those of a symmetric matrix come in both orders,
+    of which the upper triangle is stored, or couple a point with itself.
+    """
     for k in range(positions.shape[0]):
         for a in range(positions.shape[1]):
-            if weights[k, a] == 0.0:
+            if rows[k, a] == 0.0:
                 continue
             for b in range(positions.shape[2]):
-                factor = weights[k, a] * weights[k, b]
+                factor = rows[k, a] * columns[k, b]
                 if factor == 0.0 or positions[k, a, b] < 0:
                     continue
                 target = data[positions[k, a, b]]

@@ -49,8 +49,8 @@ class RestVariation:
     supports : (q, h, 3) mm or None
         Displacement of the supports' targets.
     tips : (q, t, 3) mm or None
-    rest_length : (q, cables) or None
-        Relative change of the cables' rest lengths.
+    rest_length : (q, segments) or None
+        Relative change of the rest lengths of the cables' segments.
     patches : (q, cables, s) or None
         Change of the weights of the contact points whose average is a cable's end.
     members : (cables, s) or None
@@ -214,21 +214,20 @@ def _outside_change(
         force = -system.hinge.stiffness[:, None] * variation.supports[k]
         add_forces_at(out, system.hinge.points, force)
     if system.cables is not None:
-        cables, factors = system.cables, system.factors
-        pull, stiffness, _, by_length = cables.forces(x, loads.tips, *factors.chordae)
-        force = np.zeros((len(stiffness), 3))
+        cables, factors = system.cables, system.factors.chordae
+        state = cables.state(x, loads.tips, *factors)
+        moves: dict[str, FloatArray] = {}
         if variation.tips is not None:
-            force -= np.einsum("cij,cj->ci", stiffness, variation.tips[k][cables.tip])
+            moves["tips"] = variation.tips[k]
         if variation.rest_length is not None:
-            factor = factors.chord_rest_length * variation.rest_length[k]
-            force += factor[:, None] * by_length
+            moves["length"] = factors[1] * variation.rest_length[k]
         if variation.patches is not None and variation.members is not None:
             assert system.contact is not None
             points, weights = system.contact.points, variation.patches[k]
-            moved = np.einsum("cs,csi->ci", weights, points(x)[variation.members])
-            force += np.einsum("cij,cj->ci", stiffness, moved)
+            moves["ends"] = np.einsum("cs,csi->ci", weights, points(x)[variation.members])
+            pull = (state.tension[:, None] * state.direction)[: len(weights)]
             pulled = np.zeros((len(points), 3))
             add_forces(pulled, variation.members, weights[:, :, None] * pull[:, None, :])
             add_forces_at(out, points, pulled)
-        add_forces_at(out, cables.patches, force)
+        add_forces_at(out, cables.patches, cables.change(state, **moves))
     return out

@@ -133,9 +133,10 @@ class System:
         self.held[self.fixed_nodes] = True
         if fixed_components is not None:
             self.held |= fixed_components
-        faces = [] if pressure is None else [pressure.faces]
+        groups = [solid.mesh.elements] + ([] if pressure is None else [pressure.faces])
+        groups += [np.hstack([row.nodes, column.nodes]) for row, column in self._coupled_points()]
         self._static = SparsityPattern.of(
-            adjacency(self.n, [solid.mesh.elements, *faces, *self._attached_nodes()]),
+            adjacency(self.n, groups),
             np.zeros((0, 2), dtype=np.int64) if pressure is None else pressure.rim(),
         )
         self._around = elements_of_nodes(self.n, solid.mesh.elements)
@@ -152,14 +153,14 @@ class System:
         self._build_pattern(np.zeros((0, 2), dtype=np.int64))
 
     # -- sparsity ---------------------------------------------------------------------------------
-    def _attached_nodes(self) -> list[IntArray]:
-        """Nodes of the points of cables, hinge and ties."""
-        points = (
-            self.cables.patches if self.cables else None,
-            self.hinge.points if self.hinge else None,
-            self.ties.spans if self.ties else None,
-        )
-        return [part.nodes for part in points if part is not None]
+    def _coupled_points(self) -> list[tuple[Embedding, Embedding]]:
+        """Points of cables, hinge and ties that the blocks of `_attached` couple."""
+        own = [self.hinge.points] if self.hinge else []
+        own += [self.ties.spans] if self.ties else []
+        if self.cables is None:
+            return [(points, points) for points in own]
+        first, second = map(self.cables.patches.take, self.cables.trees.pairs.T)
+        return [(first, second), *((points, points) for points in own)]
 
     def _build_pattern(self, hosts: IntArray) -> None:
         """Pattern with contact between the pairs of elements ``hosts (g, 2)``, in their order."""
@@ -170,7 +171,10 @@ class System:
         if self.pressure is not None:
             self._at_faces = self.pattern.within(self.pressure.faces)
             self._at_faces_skew = self.pattern.within_skew(self.pressure.faces)
-        self._at_attached = [self.pattern.within(nodes) for nodes in self._attached_nodes()]
+        self._at_attached = [
+            (self.pattern.within(row.nodes, column.nodes), row.weights, column.weights)
+            for row, column in self._coupled_points()
+        ]
         self._at_contact = self.pattern.between(elements[hosts[:, 0]], elements[hosts[:, 1]])
         self._at_diagonal = self.pattern.pointer[:-1]
         free, rows, columns = ~self.held, self.pattern.rows, self.pattern.all_columns
@@ -253,8 +257,8 @@ class System:
         if self.pressure is not None and p != 0 and load_stiffness:
             self.pressure.add_tangent(x, -p, self._at_faces, self._at_faces_skew, blocks)
         attached = zip(self._at_attached, self._attached(x, loads), strict=False)
-        for at, (points, _, stiffness) in attached:
-            scatter_blocks(blocks, at, points.weights, stiffness)
+        for at, (_, _, stiffness) in attached:
+            scatter_blocks(blocks, *at, stiffness)
         if self.contact is not None and pairs is not None and y is not None and slots is not None:
             self.contact.add_tangent(pairs, y, blocks, slots, self._at_contact, self._at_elements)
         return blocks
@@ -264,8 +268,8 @@ class System:
     ) -> Iterator[tuple[Embedding, FloatArray, FloatArray]]:
         """Points of cables, hinge and ties, with their internal forces N and stiffness N/mm."""
         if self.cables is not None:
-            force, stiffness, *_ = self.cables.forces(x, loads.tips, *self.factors.chordae)
-            yield self.cables.patches, force, stiffness
+            forces = self.cables.forces(x, loads.tips, *self.factors.chordae)
+            yield self.cables.patches, *forces
         if self.hinge is not None:
             yield self.hinge.points, self.hinge.forces(x, loads.hinge), self.hinge.blocks
         if self.ties is not None and loads.tie_lengths is not None:
@@ -310,12 +314,10 @@ class System:
         if parameter.kind == "pressure_scale" and self.pressure is not None:
             add_forces(out, self.pressure.faces, -loads.pressure * self.pressure.forces(x))
         elif parameter.kind in ("chord_stiffness", "chord_rest_length") and self.cables is not None:
-            which = int(parameter.kind == "chord_rest_length")
-            own = self.factors.chordae[which]
-            force = self.cables.forces(x, loads.tips, *self.factors.chordae)[2 + which]
+            which = parameter.kind.removeprefix("chord_").removeprefix("rest_")
+            own = self.factors.chordae[which == "length"]
             # A chord's factor is a product: its derivative by one factor is the product over that.
             share = own * self.cables.members(parameter.part) / parameter.value
-            patches = self.cables.patches
-            weights = patches.weights * share[:, None]
-            add_forces(out, patches.nodes, weights[:, :, None] * force[:, None, :])
+            state = self.cables.state(x, loads.tips, *self.factors.chordae)
+            add_forces_at(out, self.cables.patches, self.cables.change(state, **{which: share}))
         return out

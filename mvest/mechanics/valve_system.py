@@ -27,7 +27,7 @@ from mvest.mechanics.system import Factors, Loads, System
 from mvest.typing import FloatArray, IntArray
 from mvest.units import mmhg_to_mpa
 from mvest.valve.anatomy.valve import Valve
-from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
+from mvest.valve.mesh.solid_mesh import SolidMesh, embed
 
 
 class Pacing(Protocol):
@@ -93,6 +93,8 @@ def build_system(
         chordae.axial_stiffness,
         chordae.toe_strain,
         {name: chordae.family == k for k, name in enumerate(chordae.family_names)},
+        chordae.parent,
+        chordae.junction - valve.papillary_tips[chordae.tip[len(chordae.insertion) :]],
     )
     contact = None
     if settings.contact.active:
@@ -316,8 +318,7 @@ def _support(mesh: SolidMesh, valve: Valve, settings: MechanicsSettings) -> Hing
         simpson = np.tile([1 / 6, 4 / 6, 1 / 6], (n, 1))
         return Hinge(three.average(simpson, groups), share)
     faces = np.concatenate([np.arange(n), np.arange(n) + 2 * n])
-    points = Embedding(three.nodes[faces], three.weights[faces], three.host[faces])
-    return Hinge(points, np.tile(0.5 * share, 2))
+    return Hinge(three.take(faces), np.tile(0.5 * share, 2))
 
 
 def boundary_loading(

@@ -71,10 +71,8 @@ def measure_steps(
         plane = plane_of(valve, annulus)
         strain = force = 0.0
         if (cables := system.cables) is not None:
-            factors, at = system.factors, (x, loads.tips)
-            strain = float(cables.strain(*at, factors.chord_rest_length).max())
-            forces = cables.forces(*at, factors.chord_stiffness, factors.chord_rest_length)[0]
-            force = float(np.linalg.norm(forces, axis=1).max())
+            state = cables.state(x, loads.tips, *system.factors.chordae)
+            strain, force = float(state.strain.max()), float(state.tension.max())
         now, rest = (
             jacobian_determinants(y, mesh.elements, mesh.reference, mesh.reference.points)
             for y in (x, mesh.nodes)

@@ -34,7 +34,7 @@ def test_points_that_share_a_node_add_up():
     stiffness += stiffness.transpose(0, 2, 1)
     pattern = SparsityPattern.of(adjacency(4, [nodes]), NO_PAIRS)
     blocks = pattern.zeros()
-    scatter_blocks(blocks, pattern.within(nodes), weights, stiffness)
+    scatter_blocks(blocks, pattern.within(nodes), weights, weights, stiffness)
     expected = np.zeros((12, 12))
     for own, w, k in zip(nodes, weights, stiffness, strict=True):
         share = np.zeros((3, 12))

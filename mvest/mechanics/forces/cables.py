@@ -9,7 +9,7 @@ material points). With strain :math:`e = L/L_0 - 1` and toe strain :math:`e_t` i
         e - e_t/2 & e \ge e_t \end{cases}
 
 which is twice continuously differentiable (at :math:`e_t`: value :math:`e_t/2`, slope 1, curvature
-0).
+0). Cables may branch; their junctions are in equilibrium (`mvest.mechanics.forces.trees`).
 
 Ties are stiff springs between pairs of material points, as in an edge-to-edge clip. A pair at
 :math:`x_1, x_2` is held at the distance :math:`L` by the energy
@@ -26,10 +26,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from mvest.errors import InputError, require_numbers
+from mvest.mechanics.forces.trees import SUPPORT, Trees
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 
@@ -42,21 +44,37 @@ def cable_force(strain: FloatArray, toe: float) -> tuple[FloatArray, FloatArray]
     return force, np.where(strain >= toe, 1.0, slope)
 
 
+class CableState(NamedTuple):
+    """Segments of all cables under load."""
+
+    end: FloatArray  #: ``(k, 3)`` mm, leaflet ends and junctions
+    strain: FloatArray  #: ``(k,)``, negative if slack
+    tension: FloatArray  #: (k,) N
+    direction: FloatArray  #: ``(k, 3)``, unit vectors from start to end
+    stiffness: FloatArray  #: ``(k, 3, 3)`` N/mm, derivative of the force by the end
+    by_stiffness: FloatArray  #: ``(k,)`` N, derivative of the tension by the stiffness factor
+    by_length: FloatArray  #: ``(k,)`` N, derivative of the tension by the factor on rest lengths
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Cables:
-    """All cables of a valve.
+    """All cables of a valve: the segments of `mvest.valve.anatomy.valve.Chordae`.
 
     Attributes
     ----------
     patches : Embedding
         ``(c,)`` leaflet ends.
     tip : ndarray
-        ``(c,)`` index of the tip that each cable starts from.
+        ``(k,)`` index of the tip at each segment's root.
     rest_length, axial_stiffness : ndarray
-        ``(c,)`` mm and N.
+        ``(k,)`` mm and N.
     toe_strain : float
     families : mapping
-        Name -> ``(c,)`` bool, the cables that belong to it.
+        Name -> ``(k,)`` bool, the segments that belong to it.
+    parent : ndarray
+        ``(k,)`` junction at which each segment starts, or -1; by default all start at tips.
+    place : ndarray
+        ``(j, 3)`` mm, from the tip to where a junction hangs while its tree is slack.
     """
 
     patches: Embedding
@@ -65,9 +83,17 @@ class Cables:
     axial_stiffness: FloatArray
     toe_strain: float
     families: Mapping[str, BoolArray] = field(default_factory=dict)
+    parent: IntArray | None = None
+    place: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    trees: Trees = field(init=False)
+
+    def __post_init__(self) -> None:
+        parent = np.full(len(self.tip), -1) if self.parent is None else self.parent
+        trees = Trees.of(parent, self.rest_length, len(self.patches))
+        object.__setattr__(self, "trees", trees)
 
     def members(self, part: str) -> BoolArray:
-        """Cables ``(c,)`` of a family or papillary tip (``tip0``, ...); all if ``part`` is empty.
+        """Segments ``(k,)`` of a family or papillary tip (``tip0``, ...); all if ``part`` is empty.
 
         Raises
         ------
@@ -83,7 +109,7 @@ class Cables:
         return parts[part]
 
     def factor(self, kind: str, values: Mapping[str, float]) -> FloatArray:
-        """Factor ``(c,)`` of each cable: the product of the values of ``kind`` and ``kind.PART``.
+        """Factor ``(k,)`` of each segment: product of the values of ``kind`` and ``kind.PART``.
 
         ``kind`` is ``chord_stiffness`` or ``chord_rest_length``; other parameters are ignored.
         """
@@ -94,45 +120,98 @@ class Cables:
                 out[self.members(part)] *= value
         return out
 
-    def strain(
-        self, x: FloatArray, tips: FloatArray, length_factor: float | FloatArray = 1.0
-    ) -> FloatArray:
-        """Cable strains ``(c,)``; negative means slack."""
-        span = np.linalg.norm(self.patches(x) - tips[self.tip], axis=1)
-        return span / (length_factor * self.rest_length) - 1
-
-    def forces(
+    def state(
         self,
         x: FloatArray,
         tips: FloatArray,
-        stiffness_factor: float | FloatArray,
-        length_factor: float | FloatArray,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Force on the leaflet end, its stiffness, and its derivatives by both factors.
+        stiffness_factor: float | FloatArray = 1.0,
+        length_factor: float | FloatArray = 1.0,
+    ) -> CableState:
+        """Strain, tension and ends of every segment at nodal positions ``x (n, 3)`` mm.
 
-        Returns
-        -------
-        internal_force : ndarray
-            ``(c, 3)`` N, derivative of the cable energy by the end position.
-        stiffness : (c, 3, 3) N/mm
-        by_stiffness_factor, by_length_factor : (c, 3) N
+        Parameters
+        ----------
+        tips : (t, 3) mm
+        stiffness_factor, length_factor : float or (k,)
         """
-        arm = self.patches(x) - tips[self.tip]
+        at = tips[self.tip]
+        rest = length_factor * self.rest_length
+        ea = stiffness_factor * self.axial_stiffness
+        end = self.patches(x)
+        if len(self.place):
+            place = at[len(end) :] + self.place
+            inner = self.trees.junctions(end, at, place, rest, ea, self.toe_strain)
+            end = np.concatenate([end, inner])
+        arm = end - self.trees.start(end, at)
         span = np.linalg.norm(arm, axis=1)
         n = arm / span[:, None]
-        rest = length_factor * self.rest_length
-        value, slope = cable_force(span / rest - 1, self.toe_strain)
-        ea = stiffness_factor * self.axial_stiffness
+        strain = span / rest - 1
+        value, slope = cable_force(strain, self.toe_strain)
         dyad = n[:, :, None] * n[:, None, :]
         along, across = ea * slope / rest, ea * value / span
         stiffness = along[:, None, None] * dyad + across[:, None, None] * (np.eye(3) - dyad)
         by_length = -ea * slope * span / (rest * length_factor)
-        return (
-            (ea * value)[:, None] * n,
-            stiffness,
-            (self.axial_stiffness * value)[:, None] * n,
-            by_length[:, None] * n,
-        )
+        own = self.axial_stiffness * value
+        return CableState(end, strain, ea * value, n, stiffness, own, by_length)
+
+    def forces(
+        self, x: FloatArray, tips: FloatArray, *factors: float | FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Forces on the leaflet ends, and their stiffness; the arguments are those of `state`.
+
+        Returns
+        -------
+        internal_force : ndarray
+            ``(c, 3)`` N, derivative of the cable energy by the end positions.
+        stiffness : ndarray
+            ``(p, 3, 3)`` N/mm, derivatives for the pairs of ends ``trees.pairs``, the junctions
+            being in equilibrium.
+        """
+        state = self.state(x, tips, *factors)
+        c, own = len(self.patches), state.stiffness
+        force = state.tension[:c, None] * state.direction[:c]
+        if not len(self.place):
+            return force, own
+        # The Hessian by the ends less what the junctions give way: K - K H^-1 K.
+        pairs = self.trees.pairs
+        at = self.trees.parent[pairs]
+        freed = self.trees.compliance(own)[at[:, 0], at[:, 1]]
+        freed[np.any(at < 0, axis=1)] = 0.0
+        blocks = -(own[pairs[:, 0]] @ freed @ own[pairs[:, 1]])
+        blocks[:c] += own[:c]
+        return force, blocks
+
+    def change(
+        self,
+        state: CableState,
+        *,
+        ends: FloatArray | float = 0.0,
+        tips: FloatArray | None = None,
+        stiffness: FloatArray | float = 0.0,
+        length: FloatArray | float = 0.0,
+    ) -> FloatArray:
+        """First-order change ``(c, 3)`` N of the forces on the leaflet ends.
+
+        Parameters
+        ----------
+        ends, tips : (c, 3) and (t, 3) mm
+            Displacements of leaflet ends and papillary tips.
+        stiffness, length : (k,)
+            Changes of the factors on stiffness and rest length.
+        """
+        c, trees, own = len(self.patches), self.trees, state.stiffness
+        at = np.zeros_like(state.end) if tips is None else tips[self.tip]
+        end = np.zeros_like(state.end)
+        end[:c] += ends
+        tension = stiffness * state.by_stiffness + length * state.by_length
+        force = tension[:, None] * state.direction
+        force += np.einsum("kij,kj->ki", own, end - trees.start(end, at))
+        if len(self.place):
+            off = trees.net(force) - SUPPORT * at[c:]
+            end[:c] = 0.0
+            end[c:] = -np.einsum("abij,bj->ai", trees.compliance(own), off)
+            force += np.einsum("kij,kj->ki", own, end - trees.start(end, np.zeros_like(end)))
+        return force[:c]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

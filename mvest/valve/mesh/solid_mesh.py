@@ -128,6 +128,10 @@ class Embedding:
         flat = _weighted_sums(self.nodes, self.weights, values.reshape(len(values), -1))
         return flat.reshape(len(self.nodes), *values.shape[1:])
 
+    def take(self, rows: IntArray) -> Embedding:
+        """Some of the points, in this order."""
+        return Embedding(self.nodes[rows], self.weights[rows], self.host[rows])
+
     def average(self, coefficients: FloatArray, groups: IntArray) -> Embedding:
         """Weighted averages of the points.
 

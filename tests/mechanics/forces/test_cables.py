@@ -54,7 +54,7 @@ def test_force_points_to_the_tip_and_scales_with_both_factors():
     # Rest length 8.8: e = 0.13636, N = 16 * 0.12136 = 1.9418 N.
     force, *_ = cable().forces(end, TIP, 1.0, 1.1)
     np.testing.assert_allclose(force, [[0, 0, 16 * (10 / 8.8 - 1 - 0.015)]], rtol=1e-12)
-    np.testing.assert_allclose(cable().strain(end, TIP, 1.1), 10 / 8.8 - 1)
+    np.testing.assert_allclose(cable().state(end, TIP, 1.0, 1.1).strain, [10 / 8.8 - 1])
 
 
 @pytest.mark.parametrize("rest", [8.0, 9.85, 12.0], ids=["taut", "toe", "slack"])
@@ -65,7 +65,9 @@ def test_derivatives_by_the_factors_and_the_position(rest):
     def force(k, g, end=end):
         return c.forces(end, TIP, k, g)[0]
 
-    _, stiffness, by_stiffness, by_length = c.forces(end, TIP, k, g)
+    _, stiffness = c.forces(end, TIP, k, g)
+    state = c.state(end, TIP, k, g)
+    by_stiffness, by_length = c.change(state, stiffness=1.0), c.change(state, length=1.0)
     np.testing.assert_allclose(
         by_stiffness, (force(k + h, g) - force(k - h, g)) / (2 * h), atol=1e-7
     )
