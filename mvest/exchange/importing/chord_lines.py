@@ -45,7 +45,7 @@ def beginnings(segments: FloatArray) -> FloatArray:
 
 
 def chordae_of_lines(segments: FloatArray, tips: FloatArray, free_edge: FloatArray) -> Chordae:
-    """Chordae of segments ``(k, 2, 3)``, with papillary tips ``(t, 3)`` and the edge ``(e, 3)``, mm.
+    """Chordae of segments ``(k, 2, 3)`` mm, with papillary tips ``(t, 3)`` and edge ``(e, 3)``.
 
     They are as long as they are drawn. Chords within `MARGINAL_MM` of the edge are marginal, others
     basal. Each family is as stiff at the tips as that of the template, each of its leaflet ends has

@@ -218,7 +218,7 @@ def _leaflet(
         fitting = [f for f in fitting if better in f.words] or fitting
     # Further valve models of a frame have a number after the phase.
     fitting = [f for f in fitting if not f.again] or fitting
-    segments = [f.segment - {"scallop"} or f.segment and {f.path.stem} for f in fitting]
+    segments = [f.segment - {"scallop"} or (f.segment and {f.path.stem}) for f in fitting]
     apart = all(segments) and len(set().union(*segments)) == sum(map(len, segments))
     if len(fitting) != 1 and not (fitting and apart):
         listed = one_line(", ".join(f.path.name for f in fitting or files), 150)
