@@ -102,7 +102,7 @@ def test_branching_chordae_pull_as_the_cables(tmp_path):
     mesh = febio_mesh(model.mesh)
     system = build_system(model.valve, model.contact_valve, mesh, model.settings, model.fixed)
     n, x = len(mesh.nodes), start.copy()
-    x[:n] = mesh.nodes + [0.0, 0.3, 3.0]  # the chordae are taut
+    x[:n] = mesh.nodes + np.array([0.0, 0.3, 3.0])  # the chordae are taut
     tips = case.closed.papillary_tips
     state = system.cables.state(x[:n], tips)
     k, c = len(state.end), len(case.chordae.insertion)

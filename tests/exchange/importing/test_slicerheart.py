@@ -252,7 +252,7 @@ def test_branching_chords_of_a_fem_export(fem):
 
 def test_chords_that_start_elsewhere_or_meet_are_refused(fem):
     tips = in_lps(TREES.frames[0].papillary_tips)[::-1]
-    moved = SlicerheartOptions(tips=tuple((tips + [3.0, 4.0, 0.0]).ravel()))
+    moved = SlicerheartOptions(tips=tuple((tips + np.array([3.0, 4.0, 0.0])).ravel()))
     refused(fem, "chords begin up to 5.0 mm from the papillary tips", options=moved)
     file, ends = fem / "Chords_mesh_-_Region_0.vtk", TREES.chordae.junction[[0, 2]]
     write_lines(in_lps(np.stack([ends, TREES.chordae.junction[[1, 1]]], axis=1)), file)
