@@ -33,14 +33,13 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 from mvest.cases.plausibility import implausible_values
 from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.result import Personalised
 from mvest.problem.estimate import StudyResult
-from mvest.problem.fields import as_stored
+from mvest.problem.fields import as_stored, chord_fields
 from mvest.problem.record import (
     EstimateRecord,
     FrameFit,
@@ -184,8 +183,7 @@ def arrays_of_case(fit: Personalised) -> dict[str, Any]:
         "frames": [frame.name for frame in frames],
         "seen": [one.seen for one in fit.frames],
         "tips": [case.frame(Role.REFERENCE).papillary_tips, *(f.papillary_tips for f in frames)],
-        "chord_tip": case.chordae.tip,
-        "chord_insertion": cKDTree(surface.vertices).query(case.chordae.insertion)[1],
+        **chord_fields(case.chordae, surface.vertices),
         "generic": [one.positions["generic"] for one in fit.frames],
         "registered": [one.positions["registered"] for one in fit.frames],
         "fitted": [one.positions["personalised"] for one in fit.frames],

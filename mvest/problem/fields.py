@@ -12,22 +12,23 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
 from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.anatomy.valve import Valve
+from mvest.valve.anatomy.valve import Chordae, Valve, leverage
 
 POINTS = "observed_points_"
 NEEDED = ("triangles", "region", "rest", "annulus", "seen")
 """Arrays that every case has."""
 NO_INDEX: IntArray = np.empty(0, dtype=np.int64)
-TURNED = ("rest", "tips", "observed", "generic", "fitted")
+TURNED = ("rest", "tips", "chord_junction", "observed", "generic", "fitted")
 TYPES: Mapping[str, type] = {
     "seen": bool,
     **dict.fromkeys(("triangles", "region", "annulus", "free_edge"), np.int64),
-    **dict.fromkeys(("chord_tip", "chord_insertion"), np.int64),
+    **dict.fromkeys(("chord_tip", "chord_insertion", "chord_parent"), np.int64),
     **dict.fromkeys((*TURNED, "distance_generic", "distance_fitted"), np.float64),
 }
 """Array -> type of its elements."""
@@ -47,10 +48,13 @@ class CaseFields:
     #: ``(q, 3)`` mm for a frame without correspondence to the reference frame.
     observed_points: Mapping[str, FloatArray]
     free_edge: IntArray = field(default_factory=lambda: NO_INDEX)  #: (k,), vertices in loop order
-    #: (c,), tip and vertex of each chord.
-    chord_tip: IntArray = field(default_factory=lambda: NO_INDEX)
-    #: (c,), tip and vertex of each chord.
+    chord_tip: IntArray = field(default_factory=lambda: NO_INDEX)  #: (k,), tip of each segment
+    #: (c,), vertex of each leaflet end; or (k,), vertices of the junctions as well
     chord_insertion: IntArray = field(default_factory=lambda: NO_INDEX)
+    #: (k,), junction at which each segment starts, or -1 at its tip; empty if all start there
+    chord_parent: IntArray = field(default_factory=lambda: NO_INDEX)
+    #: (j, 3) mm, junctions at rest; empty if they are vertices
+    chord_junction: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     observed: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
     generic: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
     fitted: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
@@ -72,8 +76,38 @@ class CaseFields:
         return result
 
     def chords(self, points: FloatArray, frame: int) -> FloatArray:
-        """Ends ``(c, 2, 3)`` of the chordae; frame 0 is the reference frame."""
-        return np.stack([self.tips[frame][self.chord_tip], points[self.chord_insertion]], axis=1)
+        """Ends ``(k, 2, 3)`` of the segments of the chordae; frame 0 is the reference frame.
+
+        Junctions follow tips and leaflet ends as in `Chordae.moved`, unless they are vertices.
+        """
+        tips, own = self.tips[frame][self.chord_tip], self.tips[0][self.chord_tip]
+        ends, c = points[self.chord_insertion], len(self.chord_insertion)
+        parent = self.chord_parent if len(self.chord_parent) else np.full(c, -1)
+        if len(self.chord_junction):
+            rest = np.concatenate([self.rest[self.chord_insertion], self.chord_junction])
+            length = np.linalg.norm(np.diff(_segments(parent, rest, own), axis=1)[:, 0], axis=1)
+            share = leverage(parent, length, c)
+            moved = share @ np.nan_to_num(ends - rest[:c])
+            moved += (1 - share.sum(axis=1, keepdims=True)) * (tips - own)[c:]
+            ends = np.concatenate([ends, rest[c:] + moved])
+        return _segments(parent, ends, tips)
+
+
+def _segments(parent: IntArray, ends: FloatArray, tips: FloatArray) -> FloatArray:
+    """Ends ``(k, 2, 3)`` of segments that end at ``ends (k, 3)``, the junctions being the last."""
+    first = len(ends) - 1 - np.max(parent, initial=-1)
+    start = np.where((parent >= 0)[:, None], ends[first + parent], tips)
+    return np.stack([start, ends], axis=1)
+
+
+def chord_fields(chordae: Chordae, vertices: FloatArray) -> dict[str, NDArray[Any]]:
+    """The arrays of chordae for `CaseFields`, with leaflet ends at the nearest ``vertices``."""
+    return {
+        "chord_tip": chordae.tip,
+        "chord_insertion": np.asarray(cKDTree(vertices).query(chordae.insertion)[1]),
+        "chord_parent": chordae.parent,
+        "chord_junction": chordae.junction,
+    }
 
 
 def as_stored(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:

@@ -150,7 +150,10 @@ class Closing:
             "contact_pressure": [values[at_face] for _, values in pressed],
             "frames": [faces(x) for x in simulation.frames],
             "tips": [loading(float(t)).tips for t in simulation.times],
-            "chord_end": [system.cables.patches(x) for x in simulation.frames],
+            "chord_end": [
+                system.cables.state(x, loading(float(t)).tips, *system.factors.chordae).end
+                for t, x in zip(simulation.times, simulation.frames, strict=True)
+            ],
         }
         return {name: np.stack(states).astype(np.float32) for name, states in moving.items()} | {
             "times": simulation.times,
@@ -159,6 +162,7 @@ class Closing:
             # Along the atrial faces.
             "annulus": valve.annulus + len(valve.surface.vertices),
             "chord_tip": system.cables.tip,
+            "chord_parent": system.cables.trees.parent,
             # Between faces, each half a thickness nearer than its midsurface.
             "reach_mm": np.array(
                 model.contact_reach_mm - valve.surface.thickness[valve.free_edge].mean()

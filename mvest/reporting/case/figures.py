@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
-from mvest.problem.fields import CaseFields, case_fields, turn_of
+from mvest.problem.fields import CaseFields, case_fields, chord_fields, turn_of
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
     corner_colours,
@@ -107,7 +107,7 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
     surface, chordae = case.surface, case.chordae
     tips = case.frame(Role.REFERENCE).papillary_tips
     middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
-    ends = np.asarray(cKDTree(surface.vertices).query(chordae.insertion)[1], dtype=np.int64)
+    chords = chord_fields(chordae, surface.vertices)
     shapes = []
     for frame in case.frames:
         shut = frame.role is Role.CLOSED
@@ -129,7 +129,10 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
         )
         if frame.corresponds:
             # Elsewhere the insertions of the chordae are not known.
-            fields = replace(fields, chord_tip=chordae.tip, chord_insertion=ends)
+            ends = (frame.vertices - surface.vertices)[chords["chord_insertion"]]
+            junction = chordae.moved(frame.papillary_tips - tips, ends).junction
+            own = {**chords, "chord_junction": (junction - middle) @ axes}
+            fields = replace(fields, **own)
         role = "held out" if frame.role is Role.HELD_OUT else frame.role.value
         about = f"{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
         shapes.append(_Shape(f"{frame.name} ({role})\n{about}", fields, vertices, int(shut)))

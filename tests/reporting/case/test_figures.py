@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection, QuadMesh
 
-from mvest.problem.fields import case_fields
+from mvest.problem.fields import case_fields, chord_fields, valve_fields
 from mvest.reporting.case.drawing import (
     LINE_PIECES,
     leak_of,
@@ -14,6 +14,7 @@ from mvest.reporting.case.drawing import (
 from mvest.reporting.case.figures import case_figure, estimates_figure, frames_figure, shapes_figure
 from mvest.reporting.case.view import states_of
 from mvest.reporting.figures import ATRIUM, SIDE
+from tests.cases.folders import template_case, tree_case
 from tests.made_up_closure import made_up_case as case_of_frames
 from tests.reporting.case.made_up_case import COLUMNS, made_up_case
 
@@ -160,3 +161,36 @@ def test_no_leak_is_drawn_of_an_open_or_half_seen_valve(fields):
     for valve, images in ((whole, [0, 1, 1]), (replace(whole, observed=seen), [0, 0, 1])):
         axes = shapes_figure(valve, NAMES).axes[:3]
         assert [len(leaks(panel)) for panel in axes] == images
+
+
+def test_junctions_of_chordae_follow_tips_and_leaflets() -> None:
+    case = tree_case()
+    x, moved = case.surface.vertices, case.closed.vertices
+    tips = [frame.papillary_tips for frame in (case.frames[0], case.closed)]
+    ends = chord_fields(case.chordae, x)["chord_insertion"]
+    at_vertices = replace(case.chordae, insertion=x[ends])
+    length = np.linalg.norm(np.diff(at_vertices.ends(tips[0]), axis=1)[:, 0], axis=1)
+    chordae = replace(at_vertices, rest_length=length)
+    expected = chordae.moved(tips[1] - tips[0], (moved - x)[ends])
+    arrays = {**valve_fields(case.valve, ["closed"]), "rest": x, "tips": tips}
+    fields = case_fields(arrays | chord_fields(case.chordae, x), turned=False)
+    np.testing.assert_allclose(fields.chords(x, 0), chordae.ends(tips[0]), atol=1e-9)
+    np.testing.assert_allclose(fields.chords(moved, 1), expected.ends(tips[1]), atol=1e-9)
+    hidden = moved.copy()
+    hidden[ends[3]] = np.nan  # an unseen vertex
+    unknown = np.isnan(fields.chords(hidden, 1)).any(axis=(1, 2))
+    assert np.flatnonzero(unknown).tolist() == [3]
+    # In a simulation, the ends are points of their own.
+    points = np.concatenate([moved, expected.ends(tips[1])[:, 1]])
+    own = len(moved) + np.arange(len(chordae))
+    own = replace(fields, chord_insertion=own, chord_junction=np.zeros((0, 3)))
+    np.testing.assert_allclose(own.chords(points, 1), expected.ends(tips[1]), atol=1e-9)
+
+
+def test_segments_of_branching_chordae_are_drawn() -> None:
+    # Where a frame corresponds and is open.
+    counts = []
+    for case in (template_case(), tree_case()):
+        figure = frames_figure(case, 1.3)
+        counts.append(len(faces(figure.axes[-3]).get_paths()))
+    assert counts[1] == counts[0] + 3 * LINE_PIECES
