@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mvest.problem.fields import CaseFields
+from mvest.problem.fields import CaseFields, chord_fields
 from mvest.reporting.case.drawing import draw_valve, leaflet_colours, paint_leak, same_scale
 from mvest.reporting.figures import ATRIUM
 
@@ -11,13 +11,12 @@ __all__ = ["draw", "fields_of", "same_scale"]
 
 def fields_of(valve, reach=None):
     """What the drawing needs of a valve, whose leaflets touch within ``reach`` mm."""
-    surface, chords = valve.surface, valve.chordae
-    gaps = np.linalg.norm(surface.vertices[:, None] - chords.insertion, axis=2)
+    surface = valve.surface
     return CaseFields(
         triangles=surface.triangles, region=surface.region, rest=surface.vertices,
         annulus=valve.annulus, free_edge=valve.free_edge, frames=("closed",),
-        seen=np.array([True]), tips=valve.motion.papillary_tips, chord_tip=chords.tip,
-        chord_insertion=gaps.argmin(axis=0), observed_points={}, reach_mm=reach,
+        seen=np.array([True]), tips=valve.motion.papillary_tips, observed_points={},
+        reach_mm=reach, **chord_fields(valve.chordae, surface.vertices),
     )  # fmt: skip
 
 

@@ -242,7 +242,7 @@ class ValveCase:
         seen, length = self.uncertainty, self.uncertainty.correlation_length_mm
         return (
             f"case {self.name}{' (simulated)' if self.simulated else ''}: {regions}\n"
-            f"{len(self.surface.vertices)} vertices, {len(self.chordae)} chordae\n"
+            f"{len(self.surface.vertices)} vertices, {len(self.chordae.insertion)} chordae\n"
             f"frames: {frames}\n"
             f"seen within {seen.typical_mm:.3g} mm, "
             f"{f'correlated over {length:g} mm' if length else 'independent'}"

@@ -123,9 +123,8 @@ def _anatomy(case: ValveCase) -> Iterator[Value]:
     low, high, *_ = RANGES["thickness"]
     hint = "is it in cm?" if low <= 10 * typical <= high else ""
     yield "thickness", "the leaflets' typical thickness", typical, "thickness", hint
-    chordae = case.chordae
-    segments = np.linalg.norm(np.diff(chordae.ends(reference.papillary_tips), axis=1)[:, 0], axis=1)
-    length = (chordae.paths @ segments)[: len(chordae.insertion)]
+    ends = case.chordae.ends(np.asarray(reference.papillary_tips))
+    length = case.chordae.along(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
     for what, extreme in (("shortest", min), ("longest", max)) if len(length) else ():
         yield "chordae", f"the length of the {what} chord", extreme(length), "chord_length", ""
     for frame in case.frames:
@@ -202,12 +201,10 @@ def _closing(case: ValveCase, closed: Frame) -> Iterator[Value]:
             yield field, what, stretch, "stretch", "do its vertices correspond?"
     if closed.corresponds and len(chordae):
         _, at = cKDTree(surface.vertices).query(chordae.insertion)
-        tips = closed.papillary_tips[chordae.tip[: len(at)]]
-        length = np.linalg.norm(closed.vertices[at] - tips, axis=1)
-        rest = (chordae.paths @ chordae.rest_length)[: len(at)]
-        # Quantiles, because noise moves the ends of single chords. A branching chord is at least as
-        # strained as if it were straight.
-        tight, middle = np.quantile(length / rest - 1.0, [0.9, 0.5])
+        away = closed.vertices[at] - closed.papillary_tips[chordae.end_tip]
+        # The least strain of a branching chord. Quantiles, because noise moves single ends.
+        least = np.linalg.norm(away, axis=1) / chordae.along(chordae.rest_length) - 1.0
+        tight, middle = np.quantile(least, [0.9, 0.5])
         too_tight = tight > RANGES["chord_strain"].high
         share, strain = ("a tenth", tight) if too_tight else ("half", middle)
         what = f"the strain that {share} of the chordae exceed"

@@ -154,13 +154,13 @@ class RestGeometry:
     def tips(self, moves: FloatArray, rest_length: FloatArray | None = None) -> RestVariation:
         """Displacements ``(q, t, 3)`` mm of the closed valve's papillary tips.
 
-        ``rest_length (q, c)`` is the relative change of the chordae's rest length, if the tips
+        ``rest_length (q, k)`` is the relative change of the segments' rest length, if the tips
         determine it.
         """
         return RestVariation(self._still(len(moves)), tips=moves, rest_length=rest_length)
 
     def rest_lengths(self, changes: FloatArray) -> RestVariation:
-        """Relative changes ``(q, c)`` of the chordae's rest lengths."""
+        """Relative changes ``(q, k)`` of the rest lengths of the chordae's segments."""
         share = self.seen.valve.chordae.rest_length / self.model.valve.chordae.rest_length
         return RestVariation(self._still(len(changes)), rest_length=changes * share)
 
@@ -179,7 +179,8 @@ class RestGeometry:
         """A fresh model of the valve with another geometry; its guide changes too.
 
         Embeddings keep their material points. A displacement of the open shape moves the mesh as
-        its derivative predicts.
+        its derivative predicts. Junctions of the chordae stay: their place at rest only matters
+        while they are slack.
 
         Parameters
         ----------

@@ -100,7 +100,7 @@ def geometry_modes(
     case: ValveCase, nuisance: NuisanceGeometry, model: ClosureModel
 ) -> tuple[GeometryModes, ...]:
     """Uncertain geometry of a case; error samples, if it has any, replace errors of the frames."""
-    surface, count = case.surface, len(case.valve.chordae)
+    surface, chordae = case.surface, case.chordae
     kinds: list[GeometryModes] = []
     if case.error_samples is None:
         if nuisance.shape_mm:
@@ -124,11 +124,12 @@ def geometry_modes(
             follow = {} if lengths is None else {"rest_lengths": lengths}
             kinds.append(GeometryModes("papillary tips", {"tips": moves} | follow))
     if nuisance.insertions_mm:
-        ends = np.eye(count)[:, None, :, None] * RestGeometry(model).along_ends()[:, :, None]
+        one = np.eye(len(chordae.insertion))
+        ends = one[:, None, :, None] * RestGeometry(model).along_ends()[:, :, None]
         moves = nuisance.insertions_mm * ends.reshape(-1, *ends.shape[2:])
         kinds.append(GeometryModes("insertions", {"insertions": moves}))
     if nuisance.rest_lengths and case.chordae_follow:
-        changes = nuisance.rest_lengths * np.eye(count)
+        changes = nuisance.rest_lengths * np.eye(len(chordae))
         kinds.append(GeometryModes("rest lengths", {"rest_lengths": changes}))
     if nuisance.thickness:
         factors = nuisance.thickness * _leaflets(surface)
@@ -193,18 +194,19 @@ def _leaflets(surface: LeafletSurface) -> FloatArray:
 
 def rest_lengths_by_tips(case: ValveCase, moves: FloatArray) -> FloatArray | None:
     """As `rest_lengths_by_ends`, for tips with the same error ``(q, t, 3)`` mm in all frames."""
-    away = -moves[:, case.chordae.tip]
+    away = -moves[:, case.chordae.end_tip]
     return rest_lengths_by_ends(case, away, away)
 
 
 def rest_lengths_by_ends(
     case: ValveCase, open_moves: FloatArray, closed_moves: FloatArray
 ) -> FloatArray | None:
-    """Relative change ``(q, c)`` of rest lengths that were laid out from the frames.
+    """Relative change ``(q, k)`` of rest lengths that were laid out from the frames.
 
     They are proportional to a chord's length in the closed frame, or in the open frame if that
-    needs more (`mvest.cases.tissue.lay_out_chordae`). A closed frame without correspondence does
-    not show the insertions, so the open frame replaces it. None if rest lengths were stated.
+    needs more (`mvest.cases.tissue.lay_out_chordae`). A trunk changes as the mean of its branches.
+    A closed frame without correspondence does not show the insertions, so the open frame replaces
+    it. None if rest lengths were stated.
 
     Parameters
     ----------
@@ -214,14 +216,17 @@ def rest_lengths_by_ends(
     if not case.chordae_follow:
         return None
     closed, surface, chordae = case.frame(Role.CLOSED), case.surface, case.chordae
-    away = chordae.insertion - np.asarray(case.frame(Role.REFERENCE).papillary_tips)[chordae.tip]
+    tips = np.asarray(case.frame(Role.REFERENCE).papillary_tips)
+    away = chordae.insertion - tips[chordae.end_tip]
     moves = open_moves
     if closed.corresponds:
         place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
         ends = place.interpolate(closed.vertices, surface.triangles)
-        in_closed = ends - np.asarray(closed.papillary_tips)[chordae.tip]
+        in_closed = ends - np.asarray(closed.papillary_tips)[chordae.end_tip]
         by_open = ChordLayout().open_slack * np.linalg.norm(away, axis=1)
-        by_closed = (chordae.rest_length > (1 + 1e-6) * by_open)[:, None]
+        by_closed = (chordae.along(chordae.rest_length) > (1 + 1e-6) * by_open)[:, None]
         away = np.where(by_closed, in_closed, away)
         moves = np.where(by_closed, closed_moves, open_moves)
-    return np.asarray(np.einsum("qci,ci->qc", moves, away) / np.sum(away**2, axis=1))
+    change = np.einsum("qci,ci->qc", moves, away) / np.sum(away**2, axis=1)
+    through = chordae.paths[: len(away)]
+    return np.asarray(change @ through / through.sum(axis=0))

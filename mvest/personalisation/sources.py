@@ -247,7 +247,7 @@ def sample_frames(case: ValveCase, valve: ClosedValve) -> FrameSamples | str:
 
     def from_tips(frame: int) -> FloatArray:
         ends = place.interpolate(np.moveaxis(moves[:, frame], 0, -1), surface.triangles)
-        return np.asarray(np.moveaxis(ends, -1, 0) - tips[:, frame][:, chordae.tip])
+        return np.asarray(np.moveaxis(ends, -1, 0) - tips[:, frame][:, chordae.end_tip])
 
     rest_lengths = rest_lengths_by_ends(case, from_tips(opened), from_tips(closed))
     shape, annulus = geometry.shape(moves[:, opened]), geometry.annulus(np.stack(moved) - still)

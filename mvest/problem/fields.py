@@ -24,12 +24,12 @@ POINTS = "observed_points_"
 NEEDED = ("triangles", "region", "rest", "annulus", "seen")
 """Arrays that every case has."""
 NO_INDEX: IntArray = np.empty(0, dtype=np.int64)
-TURNED = ("rest", "tips", "chord_junction", "observed", "generic", "fitted")
+TURNED = ("rest", "tips", "observed", "generic", "fitted", "chord_junction")
 TYPES: Mapping[str, type] = {
     "seen": bool,
     **dict.fromkeys(("triangles", "region", "annulus", "free_edge"), np.int64),
     **dict.fromkeys(("chord_tip", "chord_insertion", "chord_parent"), np.int64),
-    **dict.fromkeys((*TURNED, "distance_generic", "distance_fitted"), np.float64),
+    **dict.fromkeys((*TURNED, "chord_weights", "distance_generic", "distance_fitted"), np.float64),
 }
 """Array -> type of its elements."""
 
@@ -48,13 +48,14 @@ class CaseFields:
     #: ``(q, 3)`` mm for a frame without correspondence to the reference frame.
     observed_points: Mapping[str, FloatArray]
     free_edge: IntArray = field(default_factory=lambda: NO_INDEX)  #: (k,), vertices in loop order
-    chord_tip: IntArray = field(default_factory=lambda: NO_INDEX)  #: (k,), tip of each segment
-    #: (c,), vertex of each leaflet end; or (k,), vertices of the junctions as well
+    chord_tip: IntArray = field(default_factory=lambda: NO_INDEX)  #: (k,), of the chords' segments
+    #: ``(c,)`` vertices at the leaflet ends, or ``(k,)`` if the junctions are points too
     chord_insertion: IntArray = field(default_factory=lambda: NO_INDEX)
-    #: (k,), junction at which each segment starts, or -1 at its tip; empty if all start there
+    #: ``(k,)`` junction at which each segment starts, or -1; none if no chord branches
     chord_parent: IntArray = field(default_factory=lambda: NO_INDEX)
-    #: (j, 3) mm, junctions at rest; empty if they are vertices
-    chord_junction: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    chord_junction: FloatArray | None = None  #: (j, 3) mm, in the reference frame
+    #: ``(j, c)``, shares of the leaflet ends' displacement that each junction follows
+    chord_weights: FloatArray | None = None
     observed: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
     generic: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
     fitted: FloatArray | None = None  #: ``(f, n, 3)`` mm; NaN for unobserved vertices
@@ -76,38 +77,25 @@ class CaseFields:
         return result
 
     def chords(self, points: FloatArray, frame: int) -> FloatArray:
-        """Ends ``(k, 2, 3)`` of the segments of the chordae; frame 0 is the reference frame.
+        """Ends ``(k, 2, 3)`` of the chordae's segments; frame 0 is the reference frame.
 
-        Junctions follow tips and leaflet ends as in `Chordae.moved`, unless they are vertices.
+        Junctions without a known place follow tips and leaflet ends as in `Chordae.moved`.
         """
-        tips, own = self.tips[frame][self.chord_tip], self.tips[0][self.chord_tip]
-        ends, c = points[self.chord_insertion], len(self.chord_insertion)
-        parent = self.chord_parent if len(self.chord_parent) else np.full(c, -1)
-        if len(self.chord_junction):
-            rest = np.concatenate([self.rest[self.chord_insertion], self.chord_junction])
-            length = np.linalg.norm(np.diff(_segments(parent, rest, own), axis=1)[:, 0], axis=1)
-            share = leverage(parent, length, c)
-            moved = share @ np.nan_to_num(ends - rest[:c])
-            moved += (1 - share.sum(axis=1, keepdims=True)) * (tips - own)[c:]
-            ends = np.concatenate([ends, rest[c:] + moved])
-        return _segments(parent, ends, tips)
-
-
-def _segments(parent: IntArray, ends: FloatArray, tips: FloatArray) -> FloatArray:
-    """Ends ``(k, 2, 3)`` of segments that end at ``ends (k, 3)``, the junctions being the last."""
-    first = len(ends) - 1 - np.max(parent, initial=-1)
-    start = np.where((parent >= 0)[:, None], ends[first + parent], tips)
-    return np.stack([start, ends], axis=1)
-
-
-def chord_fields(chordae: Chordae, vertices: FloatArray) -> dict[str, NDArray[Any]]:
-    """The arrays of chordae for `CaseFields`, with leaflet ends at the nearest ``vertices``."""
-    return {
-        "chord_tip": chordae.tip,
-        "chord_insertion": np.asarray(cKDTree(vertices).query(chordae.insertion)[1]),
-        "chord_parent": chordae.parent,
-        "chord_junction": chordae.junction,
-    }
+        end, tip = points[self.chord_insertion], self.tips[frame][self.chord_tip]
+        if self.chord_junction is not None and self.chord_weights is not None:
+            weights, trunks = self.chord_weights, slice(len(end), None)
+            held = (1 - weights.sum(axis=1, keepdims=True)) * (
+                tip[trunks] - self.tips[0][self.chord_tip[trunks]]
+            )
+            # The junction of an unseen end is drawn as if the end did not move.
+            moved = np.nan_to_num(end - self.rest[self.chord_insertion])
+            end = np.concatenate([end, self.chord_junction + held + weights @ moved])
+        start = np.array(tip)
+        if len(self.chord_parent):
+            on = self.chord_parent >= 0
+            first = len(end) - 1 - int(self.chord_parent.max())
+            start[on] = end[first + self.chord_parent[on]]
+        return np.stack([start, end], axis=1)
 
 
 def as_stored(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
@@ -119,6 +107,22 @@ def as_stored(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
         elif values.dtype.kind == "f" and values.shape[-1:] == (3,):
             stored[name] = values.astype(np.float32)
     return stored
+
+
+def chord_fields(chordae: Chordae, vertices: FloatArray) -> dict[str, Any]:
+    """The arrays of chordae that insert at the nearest of the ``vertices (n, 3)`` mm."""
+    fields = {
+        "chord_tip": chordae.tip,
+        "chord_insertion": cKDTree(vertices).query(chordae.insertion)[1],
+    }
+    if not len(chordae.junction):
+        return fields
+    weights = leverage(chordae.parent, chordae.rest_length, len(chordae.insertion))
+    return fields | {
+        "chord_parent": chordae.parent,
+        "chord_junction": chordae.junction,
+        "chord_weights": weights,
+    }
 
 
 def valve_fields(valve: Valve, frames: Sequence[str]) -> dict[str, NDArray[Any]]:

@@ -51,10 +51,10 @@ class ImagedPatient:
         surface, chordae = self.stated.surface, self.stated.chordae
         place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
         ends = place.interpolate(self.valve.vertices[self.closed], surface.triangles)
-        away = np.linalg.norm(ends - self.valve.tips[self.closed][chordae.tip], axis=1)
-        ratio = self.values["chord_rest_length"] * chordae.rest_length / away
+        away = np.linalg.norm(ends - self.valve.tips[self.closed][chordae.end_tip], axis=1)
+        ratio = self.values["chord_rest_length"] * chordae.along(chordae.rest_length) / away
         return {
-            name: ratio[chordae.family == family]
+            name: ratio[chordae.family[: len(ratio)] == family]
             for family, name in enumerate(chordae.family_names)
         }
 

@@ -114,7 +114,7 @@ def draw_tip_motion(template: Template, rng: np.random.Generator) -> FloatArray:
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     chordae, tips = template.chordae(), template.papillary_tips
     for k in range(2):
-        towards = (chordae.insertion[chordae.tip == k] - tips[k]).mean(axis=0)
+        towards = (chordae.insertion[chordae.end_tip == k] - tips[k]).mean(axis=0)
         direction[k] *= 1.0 if direction[k] @ towards > 0 else -1.0
     return np.asarray(direction * rng.uniform(*TIP_MOTION_MM, size=(2, 1)))
 

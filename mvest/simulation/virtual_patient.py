@@ -319,8 +319,8 @@ def _case(
         surface = replace(surface, vertices=open_shape)
         # The ends of chordae are seen on the leaflet, with its error.
         nearest = cKDTree(exact).query(chordae.insertion)[1]
-        insertion = chordae.insertion + (open_shape - exact)[nearest]
-        chordae = replace(chordae, insertion=insertion)
+        still = np.zeros_like(seen.papillary_tips)
+        chordae = chordae.moved(still, (open_shape - exact)[nearest])
     at_annulus, at_tips = misspecification.boundary(
         motion.annulus[-1], motion.papillary_tips[-1], other
     )

@@ -124,7 +124,11 @@ def upright(valve: Valve) -> Valve:
         valve,
         surface=replace(surface, vertices=turned(surface.vertices), fibre=fibre),
         papillary_tips=turned(valve.papillary_tips),
-        chordae=replace(valve.chordae, insertion=turned(valve.chordae.insertion)),
+        chordae=replace(
+            valve.chordae,
+            insertion=turned(valve.chordae.insertion),
+            junction=turned(valve.chordae.junction),
+        ),
         motion=Motion(motion.phase, turned(motion.annulus), turned(motion.papillary_tips)),
     )
 

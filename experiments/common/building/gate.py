@@ -142,6 +142,7 @@ class Closing:
         faces = embed(model.mesh, surface.vertices)
         loading = boundary_loading(system, valve, model.contact_valve, model.settings)
         assert system.cables is not None
+        loads = [loading(float(t)) for t in simulation.times]
         pressed = [contact_pressure(system, x) for x in simulation.frames]
         # Both faces of a vertex take the value of the nearest contact sample.
         at_face = np.tile(cKDTree(pressed[0][0]).query(valve.surface.vertices)[1], 2)
@@ -149,10 +150,10 @@ class Closing:
             "stress": [faces(nodal_stress(system, x)) for x in simulation.frames],
             "contact_pressure": [values[at_face] for _, values in pressed],
             "frames": [faces(x) for x in simulation.frames],
-            "tips": [loading(float(t)).tips for t in simulation.times],
+            "tips": [own.tips for own in loads],
             "chord_end": [
-                system.cables.state(x, loading(float(t)).tips, *system.factors.chordae).end
-                for t, x in zip(simulation.times, simulation.frames, strict=True)
+                system.cables.state(x, own.tips, *system.factors.chordae).end
+                for x, own in zip(simulation.frames, loads, strict=True)
             ],
         }
         return {name: np.stack(states).astype(np.float32) for name, states in moving.items()} | {
@@ -162,7 +163,7 @@ class Closing:
             # Along the atrial faces.
             "annulus": valve.annulus + len(valve.surface.vertices),
             "chord_tip": system.cables.tip,
-            "chord_parent": system.cables.trees.parent,
+            "chord_parent": valve.chordae.parent,
             # Between faces, each half a thickness nearer than its midsurface.
             "reach_mm": np.array(
                 model.contact_reach_mm - valve.surface.thickness[valve.free_edge].mean()
@@ -197,7 +198,7 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
     try:
         arrays = read_npz(path)
         count = len(arrays["chord_tip"])
-        # The ends of the chordae are points of no triangle.
+        # The ends of the chordae are points of no triangle, with the junctions last.
         shapes = np.concatenate([arrays["frames"], arrays["chord_end"]], axis=1).astype(float)
         own = {
             "rest": shapes[0],

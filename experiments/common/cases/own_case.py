@@ -243,8 +243,8 @@ def _described(case: ValveCase) -> list[str]:
     surface, tips = case.surface, case.frame(Role.REFERENCE).papillary_tips
     lines = [
         f"{len(surface.vertices)} vertices, {len(surface.triangles)} triangles, leaflets "
-        f"{', '.join(surface.region_names)}; {len(case.chordae)} chordae from {len(tips)} "
-        "papillary tips"
+        f"{', '.join(surface.region_names)}; {len(case.chordae.insertion)} chordae from "
+        f"{len(tips)} papillary tips"
     ]
     for frame in case.frames:
         same = "same vertices as the reference" if frame.corresponds else "without correspondence"

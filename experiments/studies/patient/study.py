@@ -74,8 +74,8 @@ TAILS = (0.025, 0.975)
 
 KEPT_ARRAYS = (
     "triangles", "region", "rest", "annulus", "free_edge", "frames", "seen", "tips", "chord_tip",
-    "chord_insertion", "chord_parent", "chord_junction", "generic", "fitted", "distance_generic",
-    "distance_fitted", "reach_mm",
+    "chord_insertion", "chord_parent", "chord_junction", "chord_weights", "generic", "fitted",
+    "distance_generic", "distance_fitted", "reach_mm",
 )  # fmt: skip
 """Arrays needed for Figure 3."""
 

@@ -108,6 +108,7 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
     tips = case.frame(Role.REFERENCE).papillary_tips
     middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
     chords = chord_fields(chordae, surface.vertices)
+    ends = chords["chord_insertion"]
     shapes = []
     for frame in case.frames:
         shut = frame.role is Role.CLOSED
@@ -129,10 +130,9 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
         )
         if frame.corresponds:
             # Elsewhere the insertions of the chordae are not known.
-            ends = (frame.vertices - surface.vertices)[chords["chord_insertion"]]
-            junction = chordae.moved(frame.papillary_tips - tips, ends).junction
-            own = {**chords, "chord_junction": (junction - middle) @ axes}
-            fields = replace(fields, **own)
+            moved = (frame.vertices - surface.vertices)[ends]
+            junction = chordae.moved(frame.papillary_tips - tips, moved).junction
+            fields = replace(fields, **chords | {"chord_junction": (junction - middle) @ axes})
         role = "held out" if frame.role is Role.HELD_OUT else frame.role.value
         about = f"{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
         shapes.append(_Shape(f"{frame.name} ({role})\n{about}", fields, vertices, int(shut)))

@@ -238,6 +238,15 @@ class Chordae:
         """See `paths`."""
         return paths(self.parent, len(self.insertion))
 
+    @property
+    def end_tip(self) -> IntArray:
+        """Papillary tip ``(c,)`` of each leaflet end."""
+        return self.tip[: len(self.insertion)]
+
+    def along(self, values: FloatArray) -> FloatArray:
+        """Sums ``(c,)`` of values ``(k,)`` over the segments from the tip to each leaflet end."""
+        return np.asarray(self.paths[: len(self.insertion)] @ values)
+
     def ends(self, tips: FloatArray) -> FloatArray:
         """Start and end ``(k, 2, 3)`` mm of each segment, with the papillary tips ``(t, 3)``."""
         points = np.concatenate([self.insertion, self.junction])

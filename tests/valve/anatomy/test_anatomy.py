@@ -134,3 +134,68 @@ def test_no_chordae_are_chordae_too():
     assert len(none) == 0
     assert len(replace(VALVE, chordae=none).chordae) == 0
     assert len(CHORDAE) == 34
+
+
+# Two ends on junction 1, which hangs on junction 0 with a third end; a fourth end is straight.
+TREE = Chordae(
+    np.zeros(6, int),
+    np.array([[0.0, 0, 10], [2.0, 0, 10], [4.0, 0, 10], [6.0, 0, 10]]),
+    np.zeros(6, int),
+    ("marginal",),
+    np.array([3.0, 3.5, 5.0, 12.0, 5.5, 2.0]),
+    np.full(6, 10.0),
+    0.02,
+    np.array([[2.0, 0, 5], [1.0, 0, 7]]),
+    np.array([1, 1, 0, -1, -1, 0]),
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"parent": np.array([1, 1, 0, -1, -1])}, r"parent: shape \(5,\), expected \(6,\)"),
+        (
+            {"parent": np.array([1, 1, 0, -1, -1, 2])},
+            r"parent: entry \(5,\) is 2, expected -1 to 1",
+        ),
+        ({"parent": np.array([1, 1, 0, -1, 1, 0])}, "parent: segment 0 hangs on a cycle"),
+        ({"parent": np.array([0, 0, 0, -1, -1, 0])}, "junction 1: no segment starts at it"),
+        (
+            {"tip": np.array([0, 1, 0, 0, 0, 0])},
+            "segment 1 belongs to tip 1, .* junction 1 of tip 0",
+        ),
+        ({"junction": np.zeros((0, 3))}, r"chordae tip: shape \(6,\), expected \(4,\)"),
+        ({"rest_length": np.array([3.0, 3, 5, 12, 0, 2])}, "rest_length of chord 4 is 0"),
+    ],
+)
+def test_segments_that_form_no_trees_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(TREE, **change)
+
+
+def test_segments_know_their_ends_and_their_way_to_the_tip():
+    tips = np.array([[1.0, 1.0, 1.0]])
+    start, end = TREE.ends(tips).transpose(1, 0, 2)
+    np.testing.assert_array_equal(end[:4], TREE.insertion)
+    np.testing.assert_array_equal(end[4:], TREE.junction)
+    low, high = TREE.junction
+    np.testing.assert_array_equal(start, [high, high, low, tips[0], tips[0], low])
+    # 3 + 2 + 5.5, 3.5 + 2 + 5.5, 5 + 5.5, 12.
+    np.testing.assert_allclose(TREE.along(TREE.rest_length), [10.5, 11.0, 10.5, 12.0])
+    assert np.all(CHORDAE.parent == -1)
+    np.testing.assert_array_equal(CHORDAE.along(CHORDAE.rest_length), CHORDAE.rest_length)
+
+
+def test_junctions_follow_tips_and_leaflets_in_proportion():
+    # The trunk is 5.5 of 10.667 mm (the mean of 10.5, 11 and 10.5) to the ends beyond it.
+    still, up = np.zeros((1, 3)), np.tile([0.0, 0.0, 1.0], (4, 1))
+    share = 5.5 / np.mean([10.5, 11.0, 10.5])
+    moved = TREE.moved(still, up)
+    np.testing.assert_allclose(moved.junction[0], TREE.junction[0] + [0, 0, share])
+    np.testing.assert_allclose(moved.junction[1], TREE.junction[1] + [0, 0, 7.5 / 10.75])
+    np.testing.assert_array_equal(moved.insertion, TREE.insertion + up)
+    both = TREE.moved(np.ones((1, 3)), np.ones((4, 3)))
+    np.testing.assert_allclose(both.junction, TREE.junction + 1.0)
+    # The straight end moves no junction.
+    alone = TREE.moved(still, np.array([[0.0] * 3] * 3 + [[1.0] * 3]))
+    np.testing.assert_array_equal(alone.junction, TREE.junction)
