@@ -226,7 +226,7 @@ def _branching(
 
 def write_chordae(file: Path, chordae: Chordae) -> None:
     """Write the table of chordae, without `BRANCH_COLUMNS` if none branches; lengths in mm."""
-    c, names = len(chordae.insertion), CHORD_COLUMNS
+    names: tuple[str, ...] = CHORD_COLUMNS
     points = np.concatenate([chordae.insertion, chordae.junction])
     families = [chordae.family_names[k] for k in chordae.family]
     lengths, stiffness = chordae.rest_length.tolist(), chordae.axial_stiffness.tolist()
@@ -234,7 +234,9 @@ def write_chordae(file: Path, chordae: Chordae) -> None:
     if len(chordae.junction):
         names += BRANCH_COLUMNS
         columns.append(["" if k < 0 else f"b{k}" for k in chordae.parent.tolist()])
-        columns.append([""] * c + [f"b{k}" for k in range(len(chordae.junction))])
+        columns.append(
+            [""] * len(chordae.insertion) + [f"b{k}" for k in range(len(chordae.junction))]
+        )
     write_columns(file, names, zip(*columns, strict=True))
 
 

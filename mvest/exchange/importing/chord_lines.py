@@ -58,41 +58,37 @@ def chordae_of_lines(segments: FloatArray, tips: FloatArray, free_edge: FloatArr
     """
     points, pairs = _graph(segments)
     branches = np.isin(pairs[:, 1], pairs[:, 0])
-    begin, end = pairs[np.argsort(branches, kind="stable")].T
+    # Leaflet ends first, then branching points in the order of their numbers.
+    begin, end = pairs[np.lexsort([pairs[:, 1], branches])].T
     c = int(np.count_nonzero(~branches))
     junction, count = np.unique(end[c:], return_counts=True)
     if np.any(count > 1):
         at = np.round(points[junction[np.argmax(count)]], 1).tolist()
         raise InputError(f"{count.max()} chords meet at {at}, where others begin; expected one")
-    # The segments that end at branching points are in the order of these: sort both alike.
-    order = np.r_[np.arange(c), c + np.argsort(end[c:])]
-    begin, end = begin[order], end[order]
     parent = np.where(np.isin(begin, junction), np.searchsorted(junction, begin), -1)
-    beyond = paths(parent, c)
-    root = np.argmax(beyond & (parent < 0), axis=1)
-    away, tip = cKDTree(tips).query(points[begin[root]])
+    on = paths(parent, c)
+    root = np.argmax(on & (parent < 0), axis=1)
+    away, tip = map(np.asarray, cKDTree(tips).query(points[begin[root]]))
     if away.max() > MAX_AWAY:
         raise InputError(
             f"chords begin up to {away.max():.1f} mm from the papillary tips, expected at most "
             f"{MAX_AWAY:g} mm"
         )
-    basal = cKDTree(free_edge).query(points[end[:c]])[0] > MARGINAL_MM
     template = Template().chordae()
     at_tip = template.axial_stiffness * (template.parent < 0)
     marginal = template.family == template.family_names.index(FAMILIES[0])
-    stiffness = np.where(
-        basal,
-        at_tip[~marginal].sum() / max(basal.sum(), 1),
-        at_tip[marginal].sum() / max((~basal).sum(), 1),
-    )
-    ends = beyond[:c].T  # leaflet ends (columns) beyond each segment, or its own
+    inwards = np.asarray(cKDTree(free_edge).query(points[end[:c]])[0])
+    family = (inwards > MARGINAL_MM).astype(np.int64)
+    total = np.array([at_tip[marginal].sum(), at_tip[~marginal].sum()])
+    stiffness = (total / np.maximum(np.bincount(family, minlength=2), 1))[family]
+    beyond = on[:c].T  # leaflet ends (columns) of each segment
     return Chordae(
-        tip=np.asarray(tip, dtype=np.int64),
+        tip=tip,
         insertion=points[end[:c]],
-        family=(ends @ ~basal == 0).astype(np.int64),
+        family=1 - np.any(beyond & (family == 0), axis=1),
         family_names=FAMILIES,
         rest_length=np.linalg.norm(points[end] - points[begin], axis=1),
-        axial_stiffness=ends @ stiffness,
+        axial_stiffness=beyond @ stiffness,
         toe_strain=template.toe_strain,
         junction=points[junction],
         parent=parent,

@@ -118,8 +118,9 @@ def case_of_frames(
         whole = {**regions, **document, "frames": entries}
         if chordae is not None:
             write_chordae(folder / "chordae.csv", chordae)
-            entry = {"toe_strain": chordae.toe_strain, "families": list(chordae.family_names)}
-            whole["chordae"] = {"file": "chordae.csv", **entry}
+            families = list(chordae.family_names)
+            own = {"file": "chordae.csv", "toe_strain": chordae.toe_strain, "families": families}
+            whole["chordae"] = own
         text = yaml.safe_dump(whole, sort_keys=False, allow_unicode=True)
         (folder / CASE_FILE).write_text(text, encoding="utf-8")
         try:
