@@ -31,7 +31,7 @@ from mvest.cases.frames import (
     reference_band,
 )
 from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, PointData
-from mvest.cases.tissue import CHORD_COLUMNS, point_data, read_chordae, read_leaflets
+from mvest.cases.tissue import point_data, read_chordae, read_leaflets, write_chordae
 from mvest.errors import InputError
 from mvest.exchange.surfaces import write_surface
 from mvest.files import write_atomically
@@ -90,7 +90,7 @@ def read_case(path: Path | str) -> ValveCase:
     if not folder.case.is_file():
         raise InputError(f"{folder.root}: no {CASE_FILE} in this folder")
     document = folder.document
-    check_different("regions", list(document.regions.values()), folder.wrong)
+    check_different("regions", document.region_names, folder.wrong)
     check_frames(document.frames, folder.wrong)
     seen = [read_frame(folder, number) for number in range(len(document.frames))]
     first = next(s for s in seen if s.entry.role == Role.REFERENCE)
@@ -205,10 +205,7 @@ def _write_files(folder: Path, case: ValveCase) -> None:
         "observation": observation,
         "derived": list(case.derived),
     }
-    families = [chordae.family_names[k] for k in chordae.family]
-    lengths, stiffness = chordae.rest_length.tolist(), chordae.axial_stiffness.tolist()
-    columns = (chordae.tip.tolist(), *chordae.insertion.T.tolist(), families, lengths, stiffness)
-    write_columns(folder / "chordae.csv", CHORD_COLUMNS, zip(*columns, strict=True))
+    write_chordae(folder / "chordae.csv", chordae)
     text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
     (folder / CASE_FILE).write_text(text, encoding="utf-8")
 

@@ -63,11 +63,15 @@ def read_frame(folder: CaseFolder, number: int) -> SeenFrame:
     """Read the files of one entry of ``frames``."""
     entry, where = folder.document.frames[number], f"frames.{number}"
     scale, given = MM_PER[folder.document.units.length], entry.surface
-    files: Path | dict[str, Path]
+    files: Path | dict[str, list[Path]]
     if isinstance(given, str):
         files = folder.file(given, f"{where}.surface")
     else:
-        files = {name: folder.file(f, f"{where}.surface.{name}") for name, f in given.items()}
+        listed = {name: [one] if isinstance(one, str) else one for name, one in given.items()}
+        files = {
+            name: [folder.file(one, f"{where}.surface.{name}") for one in own]
+            for name, own in listed.items()
+        }
     with folder.at(f"{where}.surface"):
         surface = read_regions(files, folder.document.regions)
     triangles, ears = without_ears(surface.triangles)

@@ -46,8 +46,8 @@ RANGES = {
          "myxomatous valves"),
         ("open_orifice", 50.0, 900.0, "mm²", "4 to 6 cm² in adults; below 1 cm² is severe "
          "stenosis, no model's valve"),
-        ("chord_length", 3.0, 45.0, "mm", "10 to 25 mm from papillary tip to insertion; branches "
-         "are shorter"),
+        ("chord_length", 3.0, 45.0, "mm", "10 to 25 mm from papillary tip to insertion, along its "
+         "branches"),
         ("thickness", 0.3, 3.5, "mm", "1.2 to 1.3 mm in the paper, 5 mm at the rough edge of "
          "myxomatous leaflets"),
         ("closing_pressure", 60.0, 200.0, "mmHg", "left ventricular systolic less left atrial "

@@ -36,14 +36,15 @@ Name = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_NAME)]
 Index = Annotated[int, Field(strict=True, ge=0, le=MAX_NUMBER)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Regions = Annotated[
-    dict[Annotated[int, Field(strict=True)], Name],
+    dict[Annotated[int, Field(strict=True)] | Name, Name],
     Field(min_length=1),
     BeforeValidator(
         lambda given: dict(enumerate(given)) if isinstance(given, list) else given,
-        json_schema_input_type=list[Name] | dict[int, Name],
+        json_schema_input_type=list[Name] | dict[int | Name, Name],
     ),
 ]
-SurfaceFiles = Name | Annotated[dict[Name, Name], Field(min_length=1)]
+Segments = Name | Annotated[list[Name], Field(min_length=1)]
+SurfaceFiles = Name | Annotated[dict[Name, Segments], Field(min_length=1)]
 Curve = Name | Annotated[list[Index], Field(min_length=3)]
 
 
@@ -78,7 +79,8 @@ class FrameEntry(_Model):
         "further closed frame, under another pressure, fitted with it) or held_out"
     )
     surface: SurfaceFiles = Field(
-        description="a file (.vtp, .vtu, .vtk, .stl, .obj, .ply), or one file for every region"
+        description="a file (.vtp, .vtu, .vtk, .stl, .obj, .ply), or one file or list of files "
+        "for every region"
     )
     annulus: Curve | None = Field(None, description=LOOP)
     free_edge: Curve | None = Field(None, description=LOOP)
@@ -98,7 +100,10 @@ class FrameEntry(_Model):
 class ChordaeEntry(_Model):
     """The table of chordae, and their common properties."""
 
-    file: Name = Field(description="a .csv file with tip,x,y,z,family,rest_length_mm,stiffness_n")
+    file: Name = Field(
+        description="a .csv file with tip,x,y,z,family,rest_length_mm,stiffness_n, and start,end "
+        "if chordae branch"
+    )
     toe_strain: Number = Field(
         0.015, gt=0, lt=0.5, description="strain over which the stiffness rises, in (0, 0.5)"
     )
@@ -148,7 +153,8 @@ class CaseFile(_Model):
     )
     units: Units = Field(description="a mapping with length, and if need be pressure and time")
     regions: Regions = Field(
-        description="a list of names (labels 0, 1, ...) or a mapping from label to name"
+        description="a list of names (labels 0, 1, ...) or a mapping from label to name; several "
+        "labels may have one name"
     )
     thickness: Number | PointData | dict[Name, Number] | None = Field(
         None, description="mm: a number, a number for every region, or {point_data: NAME}"
@@ -170,6 +176,11 @@ class CaseFile(_Model):
         description="sentences, one for everything that a program derived when it wrote the case",
     )
 
+    @property
+    def region_names(self) -> tuple[str, ...]:
+        """The names of the regions, each once."""
+        return tuple(dict.fromkeys(self.regions.values()))
+
     def files(self) -> list[tuple[str, str]]:
         """Field and name of every file that the case names."""
         named: list[tuple[str, object]] = [
@@ -178,7 +189,8 @@ class CaseFile(_Model):
         ]
         for number, frame in enumerate(self.frames):
             surface = frame.surface
-            surfaces = list(surface.values()) if isinstance(surface, dict) else [surface]
+            parts = list(surface.values()) if isinstance(surface, dict) else [surface]
+            surfaces = [name for p in parts for name in ([p] if isinstance(p, str) else p)]
             for name in (*surfaces, frame.annulus, frame.free_edge):
                 named.append((f"frames.{number}", name))
         return [(where, name) for where, name in named if isinstance(name, str)]

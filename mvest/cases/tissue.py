@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +30,7 @@ from mvest.cases.case import Frame, Role
 from mvest.cases.frames import MM_PER, CheckedFrame, SeenFrame
 from mvest.cases.schema import CaseFolder, PointData
 from mvest.errors import GeometryError, InputError
-from mvest.reading.text import indices, numbers, read_columns
+from mvest.reading.text import indices, numbers, one_line, read_columns, write_columns
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
 from mvest.valve.anatomy.template import Template, laid_out, smoothstep
@@ -37,6 +38,9 @@ from mvest.valve.anatomy.valve import Chordae, LeafletSurface
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 
 CHORD_COLUMNS = ("tip", "x", "y", "z", "family", "rest_length_mm", "stiffness_n")
+BRANCH_COLUMNS = ("start", "end")
+"""Names of the branching points at which a segment starts and ends; empty at tips and leaflets."""
+MAX_SEGMENTS = 5000
 GENERIC_THICKNESS = {"anterior": 1.32, "posterior": 1.26}
 """mm, the method paper's values (ISBI 2013)."""
 
@@ -58,7 +62,7 @@ SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
 
 def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface:
     """The midsurface of the reference frame; assumptions are added to ``derived``."""
-    seen, names = reference.seen, tuple(folder.document.regions.values())
+    seen, names = reference.seen, folder.document.region_names
     n = len(seen.vertices)
     shape = seen.vertices, seen.triangles, reference.region, names
     bare = LeafletSurface(*shape, np.tile([1.0, 0.0, 0.0], (n, 1)), np.ones(n))
@@ -147,7 +151,9 @@ def read_chordae(
         folder.derived.append(f"chordae: toe strain {entry.toe_strain:g} assumed")
     measured = ("x", "y", "z", "rest_length_mm", "stiffness_n")
     with folder.at("chordae"):
-        columns = read_columns(file, CHORD_COLUMNS)
+        columns = read_columns(file, CHORD_COLUMNS, optional=BRANCH_COLUMNS)
+        tip = indices(file, "tip", columns["tip"])
+        order, leaflet_ends, parent = _branching(file, tip, columns)
         names = entry.families or list(dict.fromkeys(columns["family"]))
         for row, name in enumerate(columns["family"]):
             if name not in names:
@@ -155,21 +161,88 @@ def read_chordae(
                     f"{file}: family of row {row} is {name!r}; known are {', '.join(names)}"
                 )
         x, y, z, length, stiffness = (numbers(file, name, columns[name]) for name in measured)
+        points = MM_PER[folder.document.units.length] * np.column_stack([x, y, z])[order]
+        family = np.array([names.index(name) for name in columns["family"]], dtype=np.int64)
         return Chordae(
-            tip=indices(file, "tip", columns["tip"]),
-            insertion=MM_PER[folder.document.units.length] * np.column_stack([x, y, z]),
-            family=np.array([names.index(name) for name in columns["family"]], dtype=np.int64),
+            tip=tip[order],
+            insertion=points[:leaflet_ends],
+            family=family[order],
             family_names=tuple(names),
-            rest_length=length,
-            axial_stiffness=stiffness,
+            rest_length=length[order],
+            axial_stiffness=stiffness[order],
             toe_strain=entry.toe_strain,
+            junction=points[leaflet_ends:],
+            parent=parent[order],
         )
+
+
+def _branching(
+    file: Path, tip: IntArray, columns: Mapping[str, list[str]]
+) -> tuple[IntArray, int, IntArray]:
+    """Rows in the order of `Chordae`, the number of leaflet ends, and the parent of each row."""
+    if len(tip) > MAX_SEGMENTS:
+        raise InputError(f"{file}: {len(tip)} rows, expected at most {MAX_SEGMENTS}")
+    starts, ends = (columns.get(name, [""] * len(tip)) for name in BRANCH_COLUMNS)
+    trunk: dict[str, int] = {}
+    for row, end in enumerate(ends):
+        if end and trunk.setdefault(end, row) != row:
+            raise InputError(
+                f"{file}: end of row {row} is {end!r} as that of row {trunk[end]}, expected one "
+                "row that ends at a branching point"
+            )
+    known = one_line(", ".join(trunk) or "none", 80)
+    for row, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        if start and start not in trunk:
+            raise InputError(
+                f"{file}: start of row {row} is {start!r}, expected a name in the column end "
+                f"({known}), or nothing at a papillary tip"
+            )
+        if end and end not in starts:
+            raise InputError(
+                f"{file}: end of row {row} is {end!r}, expected a name in the column start, or "
+                "nothing on a leaflet"
+            )
+        if start and tip[row] != tip[trunk[start]]:
+            raise InputError(
+                f"{file}: tip of row {row} is {tip[row]}, expected {tip[trunk[start]]} as in row "
+                f"{trunk[start]}, from which it branches"
+            )
+    rooted, waiting = {""}, dict(trunk)
+    while found := [name for name, row in waiting.items() if starts[row] in rooted]:
+        rooted.update(found)
+        waiting = {name: row for name, row in waiting.items() if name not in rooted}
+    for row in waiting.values():
+        raise InputError(
+            f"{file}: start of row {row} is {starts[row]!r}, in a cycle; expected a way from a "
+            "papillary tip"
+        )
+    number = {name: k for k, name in enumerate(trunk)}
+    on_leaflet = [row for row, end in enumerate(ends) if not end]
+    order = np.array([*on_leaflet, *trunk.values()], dtype=np.int64)
+    parent = np.array([number.get(start, -1) for start in starts], dtype=np.int64)
+    return order, len(on_leaflet), parent
+
+
+def write_chordae(file: Path, chordae: Chordae) -> None:
+    """Write the table of chordae, without `BRANCH_COLUMNS` if none branches; lengths in mm."""
+    names: tuple[str, ...] = CHORD_COLUMNS
+    points = np.concatenate([chordae.insertion, chordae.junction])
+    families = [chordae.family_names[k] for k in chordae.family]
+    lengths, stiffness = chordae.rest_length.tolist(), chordae.axial_stiffness.tolist()
+    columns = [chordae.tip.tolist(), *points.T.tolist(), families, lengths, stiffness]
+    if len(chordae.junction):
+        names += BRANCH_COLUMNS
+        columns.append(["" if k < 0 else f"b{k}" for k in chordae.parent.tolist()])
+        columns.append(
+            [""] * len(chordae.insertion) + [f"b{k}" for k in range(len(chordae.junction))]
+        )
+    write_columns(file, names, zip(*columns, strict=True))
 
 
 def _laid_out(
     folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
 ) -> Chordae:
-    names = list(folder.document.regions.values())
+    names = folder.document.region_names
     seen = reference.seen
     if len(names) != 2 or "anterior" not in names or len(seen.tips) != 2:
         raise InputError(
@@ -319,9 +392,9 @@ def lay_out_chordae(
     """Place the chordae of a layout on a valve with two papillary tips ``(2, 3)`` mm.
 
     Every chord starts at the nearer of the two tips in the reference frame. Rest lengths are those
-    of `mvest.valve.anatomy.template.laid_out`. The closed frame has positions ``(n, 3)`` mm of the reference's
-    vertices, or its own coordinates if its vertices do not correspond. The layout is the template's
-    for an intended closed frame (`assumed_closure`); for an observed one `SEEN_CLOSURE`, or
+    of `mvest.valve.anatomy.template.laid_out`. The closed frame has positions ``(n, 3)`` mm of the
+    reference's vertices, or its own coordinates if its vertices do not correspond. The layout is
+    the template's for an intended closed frame (`assumed_closure`); for an observed one `SEEN_CLOSURE`, or
     `SEEN_ON_BAND` if the valves are bands. InputError if there are not two tips.
     """
     if len(open_tips) != 2 or len(closed_tips) != 2:

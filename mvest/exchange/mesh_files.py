@@ -58,9 +58,12 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     with path.open("rb") as stream:  # 3D Slicer names the axes in a title or comment
         words = re.search(rb"SPACE=(LPS|RAS)\b", stream.read(4096))
     space = words[1].decode() if words else _arrays(data.GetFieldData()).get("SPACE")
+    owner = np.repeat(np.arange(len(types)), sizes)
+    onward = np.isin(types[owner], (3, 4))[:-1] & (owner[:-1] == owner[1:])
     return {
         "vertices": points,
         "triangles": triangles,
+        "lines": np.stack([corners[:-1], corners[1:]], axis=1)[onward],
         "others": dict(zip(names, counts.tolist(), strict=True)),
         "point_data": at_points,
         "cell_data": {name: values[rows] for name, values in at_cells.items()},

@@ -1,9 +1,9 @@
 """Surfaces with regions: reads VTK, STL, OBJ, PLY and GLB, writes VTP and time series.
 
-A surface comes from one labelled file or from one file per region. STL, OBJ and PLY have no labels:
-``{anterior: a.stl, posterior: p.stl}``. Coincident vertices are merged in surfaces from several
-files, and in STL, OBJ and GLB files. Merged vertices are numbered in triangle order, so that two
-files with the same triangles in the same order correspond.
+A surface comes from one labelled file or from one or several files per region. STL, OBJ and PLY
+have no labels: ``{anterior: a.stl, posterior: [p1.stl, p2.stl, p3.stl]}``. Coincident vertices are
+merged in surfaces from several files, and in STL, OBJ and GLB files. Merged vertices are numbered
+in triangle order, so that two files with the same triangles in the same order correspond.
 """
 
 from __future__ import annotations
@@ -58,6 +58,8 @@ class Surface:
     others
         Number of cells of each other type, by VTK name ("tetra", "wedge"); single vertices are
         not counted.
+    lines
+        ``(k, 2)`` ends of the line segments of the file.
     space
         "LPS" or "RAS" if 3D Slicer named the axes in a title, comment or field data; else None.
     """
@@ -70,10 +72,11 @@ class Surface:
     region: IntArray | None = None
     others: Mapping[str, int] = field(default_factory=dict)
     space: str | None = None
+    lines: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
 
 def read_mesh(path: Path | str) -> Surface:
-    """Read the points and triangles of a file.
+    """Read the points, triangles and lines of a file.
 
     Raises
     ------
@@ -113,7 +116,9 @@ def read_surface(path: Path | str) -> Surface:
     return found
 
 
-def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -> Surface:
+def read_regions(
+    files: Path | Mapping[str, Sequence[Path]], regions: Mapping[int | str, str]
+) -> Surface:
     """Read a surface and the region of each triangle.
 
     Labels come from the first of these that exists: the keys of ``files``, the cell data
@@ -123,9 +128,10 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
     Parameters
     ----------
     files
-        One file, or one for each region name.
+        One file, or the files of each region name.
     regions
-        Name of every label, in order.
+        Region of every number in the data, or of every object name; several may share a region.
+        The regions are numbered in the order of their first label.
 
     Raises
     ------
@@ -135,21 +141,22 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
     if isinstance(files, Path):
         with refusing(files, "surface"):
             return _labelled(_not_too_large(files), regions, files.suffix.lower())
-    names = list(regions.values())
+    names = list(dict.fromkeys(regions.values()))
     if unknown := [name for name in files if name not in names]:
         raise InputError(
             f"a file for the region {unknown[0]!r}; known are {', '.join(names)}; {NAME_THEM}"
         )
     if missing := [name for name in names if name not in files]:
         raise InputError(f"no file for the region {', '.join(missing)}; expected one for each")
-    parts = [_not_too_large(files[name]) for name in names]
+    parts = [_not_too_large(file) for name in names for file in files[name]]
+    of_part = [name for name in names for _ in files[name]]
     shared = set.intersection(*(set(part.point_data) for part in parts))
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
     whole = Surface(
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.triangles + s for part, s in zip(parts, start, strict=False)]),
         {name: np.concatenate([part.point_data[name] for part in parts]) for name in shared},
-        groups=np.repeat(names, [len(part.triangles) for part in parts]).tolist(),
+        groups=np.repeat(of_part, [len(part.triangles) for part in parts]).tolist(),
     )
     return _labelled(whole, regions, ".stl")
 
@@ -164,10 +171,11 @@ def _not_too_large(file: Path) -> Surface:
     return surface
 
 
-def _labelled(whole: Surface, regions: Mapping[int, str], suffix: str) -> Surface:
-    region = _labels(whole, regions)
+def _labelled(whole: Surface, regions: Mapping[int | str, str], suffix: str) -> Surface:
+    names = list(dict.fromkeys(regions.values()))
+    region = _labels(whole, regions, names)
     if region is not None:
-        empty = [name for k, name in enumerate(regions.values()) if k not in region]
+        empty = [name for k, name in enumerate(names) if k not in region]
         if empty:
             raise GeometryError(f"no triangle belongs to the region {', '.join(empty)}")
     surface = replace(whole, region=region)
@@ -196,13 +204,17 @@ def merged(surface: Surface) -> Surface:
         surface,
         vertices=surface.vertices[keep],
         triangles=rank[inverse].reshape(-1, 3),
+        lines=surface.lines[:0],
         point_data={name: values[keep] for name, values in surface.point_data.items()},
     )
 
 
-def _labels(surface: Surface, regions: Mapping[int, str]) -> IntArray | None:
-    """Index ``(m,)`` into the regions of each triangle."""
-    known = {float(label): f"{label} ({name})" for label, name in regions.items()}
+def _labels(
+    surface: Surface, regions: Mapping[int | str, str], names: list[str]
+) -> IntArray | None:
+    """Index ``(m,)`` of each triangle into the names of the regions."""
+    label_of = {label: (names.index(name), f"{label} ({name})") for label, name in regions.items()}
+    known = {float(label): own for label, own in label_of.items() if isinstance(label, int)}
     if "region" in surface.cell_data:
         return _indices(surface.cell_data["region"], known, "triangles", "cell data region")
     if "region" in surface.point_data:
@@ -216,27 +228,29 @@ def _labels(surface: Surface, regions: Mapping[int, str]) -> IntArray | None:
             )
         # The middle one of three sorted labels occurs at least twice.
         return ordered[:, 1]
-    groups, names = np.array(surface.groups), {name: name for name in regions.values()}
-    if len(set(groups)) > 1 or (len(groups) and groups[0] in names):
-        return _indices(groups, names, "triangles", "groups")
-    return np.zeros(len(surface.triangles), dtype=np.int64) if len(regions) == 1 else None
+    objects = {name: (k, name) for k, name in enumerate(names)}
+    objects |= {label: own for label, own in label_of.items() if isinstance(label, str)}
+    groups = np.array(surface.groups)
+    if len(set(groups)) > 1 or (len(groups) and groups[0] in objects):
+        return _indices(groups, objects, "triangles", "groups")
+    return np.zeros(len(surface.triangles), dtype=np.int64) if len(names) == 1 else None
 
 
 def _indices(
-    labels: NDArray[np.generic], known: Mapping[Any, str], what: str, where: str
+    labels: NDArray[np.generic], known: Mapping[Any, tuple[int, str]], what: str, where: str
 ) -> IntArray:
-    """Labels as indices into the known labels, whose values describe them in an error."""
+    """Labels as the numbers of their regions; ``known`` also has a label's words in an error."""
     if labels.ndim != 1:
         raise InputError(f"{where} has {labels.shape[1]} components, expected one label")
     found, inverse = np.unique(labels, return_inverse=True)
-    index = {label: k for k, label in enumerate(known)}
-    result = np.array([index.get(label, -1) for label in found.tolist()])[inverse]
+    numbers = [known.get(label, (-1, ""))[0] for label in found.tolist()]
+    result = np.array(numbers)[inverse]
     if len(bad := np.flatnonzero(result < 0)):
         odd = [k if isinstance(k, str) else f"{k:g}" for k in found[np.unique(inverse[bad])]]
         more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
         raise InputError(
             f"{where}: unknown label {one_line(', '.join(odd[:5]), 80)} at {what} "
-            f"{bad[:5].tolist()}{more}; known are {', '.join(known.values())}"
+            f"{bad[:5].tolist()}{more}; known are {', '.join(words for _, words in known.values())}"
             + (f"; {NAME_THEM}" if where == "groups" else "")
         )
     return result

@@ -87,7 +87,8 @@ class CaseFields:
             held = (1 - weights.sum(axis=1, keepdims=True)) * (
                 tip[trunks] - self.tips[0][self.chord_tip[trunks]]
             )
-            moved = end - self.rest[self.chord_insertion]
+            # The junction of an unseen end is drawn as if the end did not move.
+            moved = np.nan_to_num(end - self.rest[self.chord_insertion])
             end = np.concatenate([end, self.chord_junction + held + weights @ moved])
         start = np.array(tip)
         if len(self.chord_parent):

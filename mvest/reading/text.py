@@ -139,10 +139,12 @@ def named(*places: object) -> Iterator[None]:
         raise type(fault)(str(fault) if known else f"{places[0]}: {fault}") from fault
 
 
-def read_columns(file: Path, names: Sequence[str], where: str = "") -> dict[str, list[str]]:
+def read_columns(
+    file: Path, names: Sequence[str], where: str = "", optional: Sequence[str] = ()
+) -> dict[str, list[str]]:
     """Read columns of a table by name, as text; the file may have them in any order.
 
-    ``where`` names the file in errors (default: its path).
+    ``where`` names the file in errors (default: its path). The optional columns come together.
 
     Raises
     ------
@@ -159,10 +161,11 @@ def read_columns(file: Path, names: Sequence[str], where: str = "") -> dict[str,
     except (InputError, csv.Error) as fault:
         raise InputError(f"{where}: no comma-separated text: {fault}") from fault
     header = rows[0] if rows else []
-    if sorted(header) != sorted(names):
+    if sorted(header) not in (sorted(names), sorted((*names, *optional))):
+        more = f", and both or none of {','.join(optional)}" if optional else ""
         raise InputError(
             f"{where}: columns {one_line(','.join(header), 80) or 'none'}, expected "
-            f"{one_line(','.join(names), 120)}"
+            f"{one_line(','.join(names), 120)}{more}"
         )
     for number, row in enumerate(rows[1:]):
         if len(row) != len(header):

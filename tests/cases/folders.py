@@ -1,5 +1,6 @@
 """Case folders to read, made from the template and a made-up closed frame."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ import yaml
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.cases.tissue import LeafletBand
 from mvest.exchange.surfaces import write_surface
+from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.valve import Chordae
 
 TIPS = [[16.0, -0.24, -25.0], [-16.0, -0.24, -25.0]]
 
@@ -20,9 +23,14 @@ def closing(x, share=1.0):
     return x * (1.0 - share * squeeze)
 
 
-def template_case(columns=40, rows=12):
+STRAIGHT = Template(TemplateParameters().changed({"chordae.branches": 1})).chordae()
+"""The template's chordae without branches."""
+
+
+def template_case(columns=40, rows=12, branches=3):
     """The template, open, closed and held out, with something of its own in every field."""
-    valve = Template().valve(columns, rows)
+    valve = Template(TemplateParameters().changed({"chordae.branches": branches}))
+    valve = valve.valve(columns, rows)
     surface = valve.surface
 
     def frame(name, time, role, pressure, share, corresponds=True):
@@ -52,12 +60,44 @@ def template_case(columns=40, rows=12):
     )
 
 
+def branching(chordae, tips, share=(0.6, 0.8, 0.7)):
+    """The chordae with a fork, and one whose first branch forks again.
+
+    Insertions 0, 1, 2 of tip 0 hang on two junctions, 3 and 4 on another. Each segment has a rest
+    length, a stiffness and a family of its own. ``share`` is that of the way from the tip.
+    """
+    c, share = len(chordae.insertion), np.array(share)
+    x, own = chordae.insertion, tips[chordae.tip[0]]
+    towards = np.array([x[:3].mean(axis=0), x[:2].mean(axis=0), x[3:5].mean(axis=0)])
+    parent = np.full(c + 3, -1)
+    parent[[0, 1, 2, 3, 4, c + 1]] = [1, 1, 0, 2, 2, 0]
+    trees = Chordae(
+        np.append(chordae.tip, [chordae.tip[0]] * 3),
+        x,
+        np.append(chordae.family, [1, 0, 1]),
+        chordae.family_names,
+        np.ones(c + 3),
+        np.append(chordae.axial_stiffness, [40.0, 30.0, 35.0]),
+        chordae.toe_strain,
+        own + share[:, None] * (towards - own),
+        parent,
+    )
+    lengths = np.linalg.norm(np.diff(trees.ends(tips), axis=1)[:, 0], axis=1)
+    return replace(trees, rest_length=1.02 * lengths)
+
+
+def tree_case(columns=40, rows=12):
+    """The template's case with `branching` chordae."""
+    case = template_case(columns, rows, branches=1)
+    return replace(case, chordae=branching(case.chordae, case.frames[0].papillary_tips))
+
+
 def plain_folder(folder: Path, columns=24, rows=8):
     """Write the surfaces of an open and a closed frame and a table of chordae; returns case.yaml.
 
     The fields are as a user would write them: thickness and fibres are left to be derived.
     """
-    chordae = Template().chordae()
+    chordae = STRAIGHT
     folder.mkdir(exist_ok=True)
     save_frames(folder, columns=columns, rows=rows)
     table = ["tip,x,y,z,family,rest_length_mm,stiffness_n"]

@@ -61,6 +61,13 @@ def text(content, name):
     return lambda folder, _: (folder / name).write_text(content)
 
 
+def tree(*rows):
+    """Chordae of these tips, starts and ends."""
+    head = "tip,x,y,z,family,rest_length_mm,stiffness_n,start,end"
+    table = [head, *(f"{tip},0,0,0,a,9,9,{start},{end}" for tip, start, end in rows)]
+    return text("\n".join(table), "chordae.csv")
+
+
 def surface(edit, *names):
     """Replace surfaces by what ``edit`` makes of their vertices, triangles and labels."""
 
@@ -194,6 +201,30 @@ CASES = {
     "unknown family": (
         put("chordae", {"file": "chordae.csv", "families": ["marginal"]}),
         "chordae", "'basal'; known are marginal",
+    ),
+    "no column end": (
+        text("tip,x,y,z,family,rest_length_mm,stiffness_n,start\n0,0,0,0,a,1,1,\n", "chordae.csv"),
+        "chordae", r"columns tip,.*start, expected tip,.*,stiffness_n, and both or none of start,e",
+    ),
+    "unknown parent": (
+        tree((0, "a", ""), (0, "", "b"), (0, "b", "")),
+        "chordae", r"chordae.csv: start of row 0 is 'a', expected a name in the column end \(b\)",
+    ),
+    "two trunks": (
+        tree((0, "", "a"), (0, "", "a"), (0, "a", "")),
+        "chordae", r"chordae.csv: end of row 1 is 'a' as that of row 0, expected one row",
+    ),
+    "cycle of branches": (
+        tree((0, "", ""), (0, "a", "b"), (0, "b", "a"), (0, "a", "")),
+        "chordae", r"chordae.csv: start of row 1 is 'a', in a cycle; expected a way from a papi",
+    ),
+    "branch without a leaflet end": (
+        tree((0, "", ""), (0, "", "a")),
+        "chordae", r"chordae.csv: end of row 1 is 'a', expected a name in the column start, or not",
+    ),
+    "two tips in one tree": (
+        tree((0, "", "a"), (0, "a", ""), (1, "a", "")),
+        "chordae", r"chordae.csv: tip of row 2 is 1, expected 0 as in row 0, from which it branch",
     ),
     "no chordae and three tips": (
         both(put("chordae"), put(TIPS(0), THREE), put(TIPS(1), THREE)),

@@ -14,7 +14,7 @@ from mvest.cases.folder import (
 from mvest.errors import InputError
 from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.triangles import unit_rows
-from tests.cases.folders import TIPS, plain_folder, save, save_surface, template_case
+from tests.cases.folders import TIPS, plain_folder, save, save_surface, template_case, tree_case
 
 
 def assert_equal(back, expected, *leave_out):
@@ -38,8 +38,10 @@ def assert_equal(back, expected, *leave_out):
             assert a == b, entry.name
 
 
-def test_a_case_comes_back_as_it_was_written(tmp_path):
-    case = template_case()
+@pytest.mark.parametrize(
+    "case", [template_case(branches=1), tree_case()], ids=["straight", "trees"]
+)
+def test_a_case_comes_back_as_it_was_written(tmp_path, case):
     back = read_case(write_case(tmp_path / "case", case))
     assert_equal(back, case, "sha256")
     assert [path.name for path in tmp_path.iterdir()] == ["case"]
@@ -47,6 +49,23 @@ def test_a_case_comes_back_as_it_was_written(tmp_path):
     assert_equal(again, back, "sha256")  # the last digit of a fibre may differ
     assert len(back.sha256) == 64
     assert back.valve.motion.annulus.shape == (2, 40, 3)
+    header = (tmp_path / "case" / "chordae.csv").read_text().splitlines()[0]
+    assert header.endswith("stiffness_n,start,end") is bool(len(case.chordae.junction))
+
+
+def test_rows_of_branching_chordae_may_have_any_order_and_names(tmp_path):
+    case = tree_case()
+    folder = write_case(tmp_path / "case", case)
+    file = folder / "chordae.csv"
+    head, *rows = file.read_text().splitlines()
+    names = dict(zip(("b0", "b1", "b2"), ("trunk of A2", "left", "right"), strict=True))
+    turned = [",".join(names.get(cell, cell) for cell in row.split(",")) for row in rows[::-1]]
+    file.write_text("\n".join([head, *turned]))
+    back, c = read_case(folder).chordae, len(case.chordae.insertion)
+    order = np.r_[np.arange(c)[::-1], c + np.arange(3)[::-1]]
+    np.testing.assert_array_equal(back.rest_length, case.chordae.rest_length[order])
+    tips = case.frames[0].papillary_tips
+    np.testing.assert_array_equal(back.ends(tips), case.chordae.ends(tips)[order])
 
 
 def test_nothing_is_left_of_a_case_that_cannot_be_written(tmp_path):
@@ -229,3 +248,51 @@ def folder_with(tmp_path, **arrays):
 def test_a_file_of_other_samples_is_refused(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
         read_case(folder_with(tmp_path, **{**GOOD, **change}))
+
+
+# --- several segments of a leaflet --------------------------------------------------------------
+
+
+def scallops(case):
+    """Label of each triangle: 0 anterior; 1, 2 and 3 in three parts of the posterior leaflet."""
+    surface = case.surface
+    middle = surface.vertices[surface.triangles].mean(axis=1)
+    angle = np.degrees(np.arctan2(middle[:, 0], -middle[:, 1]))
+    return np.where(surface.region == 0, 0, 2 + (angle > 30.0) - (angle < -30.0))
+
+
+def test_segments_of_a_leaflet_are_one_region(tmp_path):
+    document = plain_folder(tmp_path)
+    whole = read_case(save(tmp_path, document))
+    label = scallops(whole)
+    assert set(label.tolist()) == {0, 1, 2, 3}
+    for entry, frame in zip(document["frames"], whole.frames, strict=True):
+        save_surface(tmp_path / entry["surface"], frame.vertices, frame.triangles, label)
+        for number in range(4):
+            file = tmp_path / f"{entry['name']}{number}.vtp"
+            save_surface(file, frame.vertices, frame.triangles[label == number], None)
+    document["regions"] = {0: "anterior", **dict.fromkeys((1, 2, 3), "posterior")}
+    labelled = read_case(save(tmp_path, document))
+    assert_equal(labelled, whole, "sha256")
+    for entry in document["frames"]:
+        files = [f"{entry['name']}{number}.vtp" for number in range(4)]
+        entry["surface"] = {"anterior": files[0], "posterior": files[1:]}
+    document["regions"] = ["anterior", "posterior"]
+    joined = read_case(save(tmp_path, document))
+    assert joined.surface.region_names == ("anterior", "posterior")
+    assert len(joined.surface.vertices) == len(whole.surface.vertices)
+    assert joined.closed.corresponds
+    # The same triangles of the same regions; merging numbers them anew.
+    for one in (0, 1):
+        corners = [
+            np.sort(s.vertices[s.triangles[s.region == one]].mean(axis=1), axis=0)
+            for s in (joined.surface, whole.surface)
+        ]
+        np.testing.assert_allclose(*corners, atol=1e-12)
+    # Each may be a region of its own.
+    regions = ["anterior", "P1", "P2", "P3"]
+    for entry in document["frames"]:
+        entry["surface"] = f"{entry['name']}.vtp"
+    document |= {"regions": regions, "thickness": 1.3}
+    own = read_case(save(tmp_path, document))
+    np.testing.assert_array_equal(own.surface.region, label)

@@ -11,6 +11,7 @@ from mvest.cases.folder import read_case
 from mvest.cases.plausibility import implausible_values, require_plausible
 from mvest.errors import InputError
 from mvest.observation.errors import SpatialCorrelation
+from tests.cases.folders import branching
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "case"
 
@@ -44,6 +45,14 @@ def test_the_example_is_in_order(case):
     require_plausible(case)
     with pytest.raises(InputError, match=r"is not plausible: .*kPa.*; .*tip"):
         require_plausible(under(16.0)(tips_away(case)))
+
+
+def test_a_chord_is_as_long_as_the_way_along_its_branches(case):
+    # Its segments are shorter than any chord, its way is about as long as before.
+    tips, chordae = case.frame(Role.REFERENCE).papillary_tips, case.chordae
+    trees = branching(chordae, tips, (0.9, 0.95, 0.9))
+    assert np.linalg.norm(np.diff(trees.ends(tips), axis=1), axis=2).min() < 1.5
+    assert implausible_values(replace(case, chordae=trees)) == ()
 
 
 @pytest.mark.parametrize("seed", range(2))

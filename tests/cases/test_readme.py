@@ -10,6 +10,7 @@ import pytest
 import mvest.cases
 from mvest.cases.folder import read_case
 from mvest.cases.schema import CaseFile, FrameEntry
+from mvest.cases.tissue import BRANCH_COLUMNS, CHORD_COLUMNS
 from mvest.valve.anatomy.template import Template
 from tests.cases.folders import closing, save, save_frames
 
@@ -21,6 +22,13 @@ def test_every_field_is_in_the_readme_and_no_other():
     documented = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", README, flags=re.MULTILINE)
     names = {name for cell in documented for name in re.findall(r"\w+", cell)}
     assert names == set(CaseFile.model_fields) | set(FrameEntry.model_fields)
+
+
+def test_the_table_of_branching_chordae_has_all_columns():
+    (table,) = re.findall(r"```csv\n(.*?)```", README, flags=re.DOTALL)
+    head, *rows = (line.split(",") for line in table.splitlines())
+    assert tuple(head) == (*CHORD_COLUMNS, *BRANCH_COLUMNS)
+    assert [row[-2:] for row in rows] == [["", "A"], ["A", ""], ["A", ""]]
 
 
 def test_the_smallest_example_is_read(tmp_path):

@@ -14,11 +14,13 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, require_numbers
 from mvest.exchange.febio.document import LAWS, FebDocument, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.forces.cables import cable_force
+from mvest.mechanics.forces.trees import SUPPORT
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading, build_system
 from mvest.typing import FloatArray
 from mvest.valve.mesh.given import GivenValve
+from mvest.valve.mesh.solid_mesh import Embedding
 
 GENERIC = {
     "E_f": {"anterior": 6.23, "posterior": 2.09},
@@ -159,10 +161,14 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
     pressure = np.array([loading(t).pressure for t in times]) * system.factors.pressure
     phase = np.stack([times, [protocol.phase(t) for t in times]], axis=1)
     opened, closed = loading(0.0), loading(protocol.ramp)
-    ends = cables.patches(mesh.nodes)
-    further = [opened.tips, ends, opened.hinge]
+    # The leaflet ends and junctions of the chordae, and anchors that hold slack junctions.
+    ends, c = (
+        cables.state(mesh.nodes, opened.tips, *system.factors.chordae).end,
+        len(cables.patches),
+    )
+    further = [opened.tips, ends, ends[c:], opened.hinge]
     at = np.cumsum([len(mesh.nodes), *map(len, further)])
-    tip_nodes, end_nodes, hinge_nodes = (np.arange(a, b) for a, b in itertools.pairwise(at))
+    tip_nodes, end_nodes, anchors, hinge_nodes = (np.arange(*k) for k in itertools.pairwise(at))
     tissue = [mechanics.tissue[n].material(values[f"E_f.{n}"]) for n in mesh.region_names]
     document = FebDocument(
         mesh,
@@ -174,9 +180,11 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
         further=np.concatenate(further),
         density=mechanics.density * options.density_factor,
     )
-    document.prescribe("tips", tip_nodes, closed.tips - opened.tips, phase)
+    move = closed.tips - opened.tips
+    moves = np.concatenate([move, move[cables.tip[c:]]])
+    document.prescribe("tips", np.append(tip_nodes, anchors), moves, phase)
     document.prescribe("annulus", hinge_nodes, closed.hinge - opened.hinge, phase)
-    document.average(end_nodes, cables.patches)
+    document.average(end_nodes[:c], cables.patches)
     document.press(mesh.pressure_faces, np.stack([times, pressure], axis=1))
     if options.dynamic and mechanics.damping.alpha:
         document.damp(mechanics.damping.alpha)
@@ -187,14 +195,18 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
         kc = 0.5 * mechanics.contact.reference_pressure
         kc /= _pressure_of_sheets(gap, EXPONENT, inner, reach)
         document.touch(opposite_faces(mesh), kc=kc, p=EXPONENT, R_in=inner, R_out=reach)
-    pairs = np.stack([tip_nodes[cables.tip], end_nodes], axis=1)
+    parent = cables.trees.parent
+    start = np.where(parent < 0, tip_nodes[cables.tip], end_nodes[np.maximum(c + parent, 0)])
+    pairs = np.stack([start, end_nodes], axis=1)
     document.pull(pairs, _chord_forces(system, document.nodes[pairs]))
-    document.support(hinge_nodes, hinge.points, hinge.stiffness)
+    slack = Embedding(end_nodes[c:, None], np.ones((len(anchors), 1)), anchors)
+    supports = (hinge_nodes, hinge.points, hinge.stiffness), (anchors, slack, SUPPORT)
+    document.support(*supports[: 1 + bool(len(anchors))])
     return document
 
 
 def _chord_forces(system: System, ends: FloatArray) -> list[FloatArray]:
-    """Elongation relative to the initial length (mm) and force (N) of chords ``(c, 2, 3)``."""
+    """Elongation relative to the initial length (mm) and force (N) of segments ``(k, 2, 3)``."""
     cables, factors = system.cables, system.factors
     assert cables is not None
     apart = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)

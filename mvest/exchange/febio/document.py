@@ -242,21 +242,31 @@ class FebDocument:
             for member, weight in terms:
                 _fill(_add(follow, "child_dof"), node=member, dof=axis, value=weight)
 
-    def support(self, targets: IntArray, of: Embedding, stiffness: FloatArray) -> None:
-        """Pull weighted averages ``(k,)`` of nodes to nodes ``(k,)`` by ``stiffness (k,)`` N/mm."""
-        largest = stiffness.max()
+    def support(self, *groups: tuple[IntArray, Embedding, FloatArray | float]) -> None:
+        """Pull weighted averages ``(k,)`` of nodes to nodes ``(k,)``, each group by a stiffness.
+
+        The first entry of a group has the nodes, its last one ``(k,)`` N/mm or one number. Each
+        average begins at its node.
+        """
+        largest = max(np.max(stiffness) for *_, stiffness in groups)
         constraint = _add(self._at["Constraints"], "constraint", type="linear constraint")
         constraint.set("name", "support")
         _fill(constraint, laugon=0, penalty=largest)
         # The energy of a constraint is half its square times the penalty.
-        factors = np.sqrt(stiffness / largest)
-        rows = zip(targets, factors, _sums(of), strict=True)
+        rows = [
+            (target, np.sqrt(own / largest), terms)
+            for at, of, stiffness in groups
+            for target, own, terms in zip(
+                at, np.broadcast_to(stiffness, at.shape), _sums(of), strict=True
+            )
+        ]
         for (target, factor, terms), axis in itertools.product(rows, AXES):
             own = _add(constraint, "linear_constraint")
             _add(own, "node", -factor, id=target + 1, bc=axis)
             for member, weight in terms:
                 _add(own, "node", factor * weight, id=member, bc=axis)
         # Nodes without elements have no degrees of freedom in FEBio; a weak spring adds them.
+        targets = np.concatenate([at for at, *_ in groups])
         material = self._spring("targets", np.stack([targets, np.roll(targets, 1)], axis=1))
         material.attrib |= {"type": "linear spring", "name": "none"}
         _fill(material, E=1e-12)

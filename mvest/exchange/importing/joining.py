@@ -126,6 +126,46 @@ class Leaflet:
         return turned[: cut + 1], np.append(turned[cut:], turned[0])
 
 
+def united(segments: Sequence[Leaflet]) -> Leaflet:
+    """One leaflet from its segments (scallops), joined where their boundaries run side by side.
+
+    Raises
+    ------
+    GeometryError
+        A segment is farther than `SEAM_MM` from all others, or touches one at a point only.
+    """
+    whole, *rest = segments
+    while rest:
+        near = [_nearest(whole.curve, other.curve)[0] <= SEAM_MM for other in rest]
+        other = rest.pop(int(np.argmax([own.sum() for own in near])))
+        away, number = _nearest(whole.curve, other.curve)
+        # Roll the loop to begin with the first vertex of the run that is near the other segment.
+        beside = away <= SEAM_MM
+        begins = np.flatnonzero(beside & ~np.roll(beside, 1))
+        if len(begins) != 1 or beside.sum() < 2:
+            raise GeometryError(
+                f"segments of a leaflet, {away.min():.1f} mm apart, run side by side along "
+                f"{len(begins)} parts of their boundaries, expected one within {SEAM_MM:g} mm"
+            )
+        run = np.roll(np.arange(len(away)), -int(begins[0]))[: int(beside.sum())]
+        first, last = number[run[[0, -1]]]
+        k = len(other.loop)
+        ways = [
+            np.arange(first, first + (last - first) % k + 1) % k,
+            np.arange(first, first - (first - last) % k - 1, -1) % k,
+        ]
+        opposite = min(ways, key=lambda way: _nearest(other.curve[way], whole.curve)[0].mean())
+        faces, n = other.triangles, len(whole.vertices)
+        # The boundaries of two surfaces of the same orientation run against each other.
+        faces = faces[:, ::-1] if opposite is ways[0] else faces
+        vertices = np.concatenate([whole.vertices, other.vertices])
+        strip, _, _ = _strip(vertices, whole.loop[run], n + other.loop[opposite])
+        holes = whole.holes + other.holes
+        joined_ = Leaflet.of(vertices, np.concatenate([whole.triangles, faces + n, strip]))
+        whole = replace(joined_, holes=holes + joined_.holes)
+    return whole
+
+
 def loop_length(curve: FloatArray) -> float:
     """Length (mm) of a closed curve ``(k, 3)``."""
     return float(np.linalg.norm(curve - np.roll(curve, -1, axis=0), axis=1).sum())

@@ -27,7 +27,7 @@ WORDS = {
     "posterior": {"posterior", "pml", "pmvl", "p1", "p2", "p3"},
 }
 """Words that name leaflets, and scallops (Carpentier)."""
-SCALLOPS = {"a1", "a2", "a3", "p1", "p2", "p3"}
+SCALLOPS = {"a1", "a2", "a3", "p1", "p2", "p3", "scallop"}
 OTHERS = {"papillary", "muscle", "commissure", "annulus", "chordae", "tricuspid", "aortic"}
 """Words that name other structures."""
 VALVE_MM = (10.0, 120.0)

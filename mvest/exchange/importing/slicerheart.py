@@ -10,10 +10,12 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mvest.cases.band import find_loops
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import InputError
-from mvest.exchange.importing.joining import EDGE_MM, Leaflet, commissures_on, joined
+from mvest.exchange.importing.chord_lines import MARGINAL_MM, beginnings, chordae_of_lines
+from mvest.exchange.importing.joining import EDGE_MM, Leaflet, commissures_on, joined, united
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
 from mvest.exchange.importing.written import (
     REGIONS,
@@ -25,6 +27,7 @@ from mvest.exchange.importing.written import (
 from mvest.exchange.markups import TO_LPS
 from mvest.reading.text import named
 from mvest.typing import FloatArray
+from mvest.valve.anatomy.valve import Chordae
 
 OPEN, CLOSED = ("MD", "ED", "CD"), ("MS", "ES", "CS")
 """Phases in order of preference."""
@@ -112,7 +115,9 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
         raise InputError(f"{source}: no such folder; expected one that SlicerHeart wrote")
     derived: list[str] = []
     with named(source):
-        frames = _frames(_chosen(source, options, derived), options, derived)
+        chosen = _chosen(source, options, derived)
+        frames = _frames(chosen, options, derived)
+        chordae = _chordae(chosen[0][0].chords, frames[0], derived)
         std, known = options.std_mm, {"correlation_length_mm": CORRELATED_MM}
         document = {
             "name": "valve from SlicerHeart",  # names of files and scenes may identify patients
@@ -121,7 +126,7 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
             **({} if std is None else {"observation": {"std_mm": std, **known}}),
             "derived": derived,
         }
-        return case_of_frames(frames, document, mirrored=options.mirrored)
+        return case_of_frames(frames, document, chordae, mirrored=options.mirrored)
 
 
 def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> list[_Seen]:
@@ -215,9 +220,16 @@ def _tips_of(
     before: Sequence[FoundFrame],
     notes: list[str],
 ) -> FloatArray:
-    """Papillary tips ``(2, 3)`` mm of a phase."""
+    """Papillary tips ``(t, 3)`` mm of a phase, two unless they are where chords begin."""
     if role is Role.REFERENCE and options.tips is not None:
         return np.array(options.tips, dtype=np.float64).reshape(2, 3)
+    if seen.tips is None and len(begin := beginnings(seen.chords)) > 1:
+        notes.append(f"{len(begin)} papillary tips where chords begin")
+        middles = [np.concatenate([x for x, _ in own]).mean(axis=0) for own in seen.leaflets]
+        down = begin.mean(axis=0) - np.mean(middles, axis=0)
+        # Seen from the atrium, the antero-lateral one is on the left of the anterior leaflet.
+        left = np.cross(middles[0] - middles[1], down)
+        return begin[np.argsort(-begin @ left)]
     if seen.tips is None and before:
         notes.append(f"papillary tips of {before[0].name}")
         return before[0].tips
@@ -229,6 +241,21 @@ def _tips_of(
     return seen.tips
 
 
+def _chordae(segments: FloatArray, reference: FoundFrame, derived: list[str]) -> Chordae | None:
+    """The exported chordae; None without any."""
+    if not len(segments):
+        return None
+    surface = reference.surface
+    edge = find_loops(surface.vertices, surface.triangles, reference.tips).free_edge
+    chordae = chordae_of_lines(segments, reference.tips, surface.vertices[edge])
+    derived.append(
+        f"chordae: {len(chordae.insertion)} leaflet ends and {len(chordae.junction)} branching "
+        "points of the export, as long as drawn; those within "
+        f"{MARGINAL_MM:g} mm of the free edge are marginal; as stiff together as the template's"
+    )
+    return chordae
+
+
 def _placed(
     seen: SeenPhase, tips: FloatArray, mirrored: bool, notes: list[str]
 ) -> tuple[list[Leaflet], FloatArray, FloatArray]:
@@ -237,9 +264,9 @@ def _placed(
     The annulus must be close to the leaflets, and landmarks must not be mirrored.
     """
     leaflets, marks = [], seen.landmarks
-    for name, (vertices, triangles) in zip(REGIONS, seen.leaflets, strict=True):
+    for name, segments in zip(REGIONS, seen.leaflets, strict=True):
         with named(f"{name} leaflet"):
-            leaflets.append(Leaflet.of(vertices, triangles))
+            leaflets.append(united([Leaflet.of(*segment) for segment in segments]))
         if leaflets[-1].holes:
             notes.append(f"{name} leaflet: {leaflets[-1].holes} holes closed")
     edges = np.concatenate([leaflet.curve for leaflet in leaflets])

@@ -19,9 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.exchange.importing.leaflet_parts import SCALLOPS, WORDS
 from mvest.exchange.importing.written import REGIONS
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
-from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_mesh, read_surface
 from mvest.reading.text import numbers, one_line, read_columns
 from mvest.typing import FloatArray, IntArray
 
@@ -44,7 +45,6 @@ _NAME = re.compile(
 )
 _PHASE = re.compile(r"(?:.*[^A-Za-z0-9])?(?P<phase>[MEC][DS])(?:[^A-Za-z0-9].*)?")
 """Phases in other names, where CT is a modality and P1 a scallop."""
-LEAFLETS = {"anterior": {"anterior", "aml", "amvl"}, "posterior": {"posterior", "pml", "pmvl"}}
 MUSCLES = (
     ({"antero", "lateral"}, {"anterolateral"}, {"al"}),
     ({"postero", "medial"}, {"posteromedial"}, {"pm"}),
@@ -52,7 +52,8 @@ MUSCLES = (
 """Words for the papillary muscles, in the order of a case's tips."""
 PAPILLARY = {"papillary", "muscle", "muscles", "tip", "tips"}
 ANNULUS, MARKS = {"annulus"}, {"landmarks", "labels"}
-NO_LEAFLET = PAPILLARY | ANNULUS | {"ventricular", "chords", "chordae"}
+CHORDS = {"chords", "chordae"}
+NO_LEAFLET = PAPILLARY | ANNULUS | CHORDS | {"ventricular"}
 LANDMARKS = ("A", "P", "AL", "PM", "ALC", "PMC")
 _COMMON = ("Filename", "Phase", "FrameNumber", "Valve")
 _TABLES = {
@@ -81,7 +82,9 @@ class _File:
             found.get(key, "") for key in ("scene", "valve", "frame", "phase", "again")
         )
         self.words = words_of(found.get("rest", stem))
-        named = [name for name, words in LEAFLETS.items() if words & self.words]
+        # A scallop is one word here, as in "P2" or "posterior leaflet P2".
+        self.segment = set(re.findall(r"[a-z]+\d*", found.get("rest", stem).lower())) & SCALLOPS
+        named = [name for name, words in WORDS.items() if words & (self.words | self.segment)]
         self.leaflet = "" if len(named) != 1 or self.words & NO_LEAFLET else named[0]
 
     def fits(self, other: _File) -> bool:
@@ -96,10 +99,12 @@ class SeenPhase:
     """One valve in one phase; ``notes`` lists assumptions and unused data."""
 
     phase: str  # key of `PHASES`; empty if the export names none
-    leaflets: tuple[tuple[FloatArray, IntArray], ...]  # anterior, posterior: (n, 3) mm, (m, 3)
+    #: segments of the anterior and of the posterior leaflet: (n, 3) mm, (m, 3)
+    leaflets: tuple[tuple[tuple[FloatArray, IntArray], ...], ...]
     contour: FloatArray | None  # (k, 3) mm, closed curve along the annulus
     landmarks: dict[str, FloatArray]  # (3,) mm by label, of `LANDMARKS`
     tips: FloatArray | None  # (2, 3) mm, antero-lateral and postero-medial
+    chords: FloatArray  # (k, 2, 3) mm, segments from the tips to the leaflets
     notes: tuple[str, ...]
 
 
@@ -141,7 +146,7 @@ def read_folder(
         )
     phases = [phase for phase in PHASES if any(f.phase == phase for f in chosen)]
     seen = {
-        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], lists)
+        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], models, lists)
         for phase in phases or [""]
     }
     if phases and not all(f.phase for f in chosen):
@@ -151,7 +156,9 @@ def read_folder(
     return seen
 
 
-def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> SeenPhase:
+def _read_phase(
+    folder: Path, mine: Sequence[_File], models: Sequence[_File], lists: Sequence[_File]
+) -> SeenPhase:
     """Read one phase from its leaflet surfaces."""
     notes: list[str] = []
     this = min(mine, key=lambda f: int(f.frame or -1))
@@ -184,6 +191,10 @@ def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> 
                 notes.append(f"{item.kind} of {len(item.labels)} points ({listed}) not used")
             if item.unplaced:
                 notes.append(f"points {', '.join(item.unplaced)} not placed, so not used")
+    chords = [np.zeros((0, 2, 3))]
+    for file in (f for f in models if f.words & CHORDS and f.phase == this.phase and f.fits(this)):
+        drawn = read_mesh(file.path)
+        chords.append((drawn.vertices * TO_LPS[drawn.space or "RAS"])[drawn.lines])
     known = {label.strip().upper(): point for label, point in landmarks.items()}
     if unused := known.keys() - {"", *LANDMARKS}:
         notes.append(f"landmarks {', '.join(sorted(unused))} not used")
@@ -193,29 +204,35 @@ def _read_phase(folder: Path, mine: Sequence[_File], lists: Sequence[_File]) -> 
         next((curve for curve in curves if len(curve) >= MIN_CONTOUR), None),
         {label: known[label] for label in LANDMARKS if label in known},
         np.stack([tips[k] for k in range(2)]) if len(tips) == 2 else None,
+        np.concatenate(chords),
         tuple(dict.fromkeys(one_line(note) for note in notes)),
     )
 
 
 def _leaflet(
     folder: Path, files: Sequence[_File], name: str, notes: list[str]
-) -> tuple[FloatArray, IntArray]:
-    """The surface of a leaflet; atrial sides and fitted shells come first."""
+) -> tuple[tuple[FloatArray, IntArray], ...]:
+    """The segments of a leaflet, mostly one; atrial sides and fitted shells come first."""
     fitting = [f for f in files if f.leaflet == name]
     for better in ("atrial", "fit"):
         fitting = [f for f in fitting if better in f.words] or fitting
     # Further valve models of a frame have a number after the phase.
     fitting = [f for f in fitting if not f.again] or fitting
-    if len(fitting) != 1:
+    segments = [f.segment - {"scallop"} or (f.segment and {f.path.stem}) for f in fitting]
+    apart = all(segments) and len(set().union(*segments)) == sum(map(len, segments))
+    if len(fitting) != 1 and not (fitting and apart):
         listed = one_line(", ".join(f.path.name for f in fitting or files), 150)
         raise InputError(
-            f"{folder}: {len(fitting)} surfaces of the {name} leaflet ({listed}), expected one; "
-            "only=WORD takes those with a word in their names"
+            f"{folder}: {len(fitting)} surfaces of the {name} leaflet ({listed}), expected one, or "
+            "one of each scallop (P1, P2, ...); only=WORD takes those with a word in their names"
         )
-    surface = read_surface(fitting[0].path)
-    if surface.space is None:
+    if apart:
+        listed = ", ".join(sorted(segment.upper() for own in segments for segment in own))
+        notes.append(f"{name} leaflet: {listed}")
+    surfaces = [read_surface(f.path) for f in fitting]
+    if any(surface.space is None for surface in surfaces):
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
-    return surface.vertices * TO_LPS[surface.space or "RAS"], surface.triangles
+    return tuple((s.vertices * TO_LPS[s.space or "RAS"], s.triangles) for s in surfaces)
 
 
 def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:

@@ -18,9 +18,11 @@ from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import implausible_values
 from mvest.cases.schema import CASE_FILE
+from mvest.cases.tissue import write_chordae
 from mvest.errors import InputError, MvestError
 from mvest.exchange.surfaces import Surface, write_surface
 from mvest.typing import FloatArray
+from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.midsurface import Midsurface
 
 REGIONS = ("anterior", "posterior")
@@ -78,13 +80,14 @@ class FoundFrame:
 def case_of_frames(
     frames: Sequence[FoundFrame],
     document: Mapping[str, Any],
+    chordae: Chordae | None = None,
     *,
     mirrored: bool,
 ) -> ValveCase:
     """Make a case from frames without common vertices, with the usual checks.
 
     The regions of the frames are 0 (anterior) and 1 (posterior). ``document`` has further fields of
-    ``case.yaml``; ``mirrored`` accepts a mirrored valve.
+    ``case.yaml``; without ``chordae`` they are laid out; ``mirrored`` accepts a mirrored valve.
 
     Raises
     ------
@@ -113,6 +116,11 @@ def case_of_frames(
         units = {"length": "mm", "pressure": "mmHg", "time": "s"}
         regions = {"version": 1, "units": units, "regions": list(REGIONS)}
         whole = {**regions, **document, "frames": entries}
+        if chordae is not None:
+            write_chordae(folder / "chordae.csv", chordae)
+            families = list(chordae.family_names)
+            own = {"file": "chordae.csv", "toe_strain": chordae.toe_strain, "families": families}
+            whole["chordae"] = own
         text = yaml.safe_dump(whole, sort_keys=False, allow_unicode=True)
         (folder / CASE_FILE).write_text(text, encoding="utf-8")
         try:

@@ -8,9 +8,16 @@ import pytest
 from experiments import cli
 from mvest.cases.folder import write_case
 from mvest.errors import InputError
-from mvest.exchange.exporting.febio import FebioOptions, export_febio
+from mvest.exchange.exporting.febio import (
+    FebioOptions,
+    export_febio,
+    model_of_case,
+    valve_document,
+)
+from mvest.exchange.febio.document import febio_mesh
 from mvest.mechanics.forces.cables import cable_force
-from tests.cases.folders import template_case
+from mvest.mechanics.valve_system import build_system
+from tests.cases.folders import template_case, tree_case
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +90,48 @@ def test_a_chord_pulls_as_here(root):
             )
             found = np.interp(elongation, force[:, 0], force[:, 1])
             assert found == pytest.approx(float(wanted), abs=1e-4)
+
+
+def test_branching_chordae_pull_as_the_cables(tmp_path):
+    """Springs of the file, its leaflet ends and junctions at a closed state, in balance."""
+    case, options = tree_case(), FebioOptions(columns=12, rows=2)
+    model = model_of_case(case, options)
+    target = valve_document(model, np.zeros(0), options).write(tmp_path / "trees.feb")
+    root = Xml.parse(target).getroot()
+    start = rows(root.findall("Mesh/Nodes/node"))
+    mesh = febio_mesh(model.mesh)
+    system = build_system(model.valve, model.contact_valve, mesh, model.settings, model.fixed)
+    n, x = len(mesh.nodes), start.copy()
+    x[:n] = mesh.nodes + np.array([0.0, 0.3, 3.0])  # the chordae are taut
+    tips = case.closed.papillary_tips
+    state = system.cables.state(x[:n], tips)
+    k, c = len(state.end), len(case.chordae.insertion)
+    x[n : n + 2], x[n + 2 : n + 2 + k] = tips, state.end
+    tension = []
+    force = np.zeros_like(x)
+    for number in range(k):
+        spring = root.find(f"Mesh/DiscreteSet[@name='spring_{number}']/delem")
+        pair = values(spring).astype(int) - 1
+        arm, before = np.diff(x[pair], axis=0)[0], np.diff(start[pair], axis=0)[0]
+        law = rows(root.find(f".//discrete_material[@name='chord_{number}']/force/points"))
+        longer = np.linalg.norm(arm) - np.linalg.norm(before)
+        tension.append(np.interp(longer, *law.T))
+        pull = tension[-1] * arm / np.linalg.norm(arm)
+        force[pair[0]] += pull
+        force[pair[1]] -= pull
+    assert len(tension) == c + 3
+    assert min(state.tension[[0, 1, 2, 3, 4, c, c + 1, c + 2]]) > 0.01
+    np.testing.assert_allclose(tension, state.tension, atol=1e-4)
+    junctions = n + 2 + c + np.arange(3)
+    assert np.abs(force[junctions]).max() < 3e-4
+    ends = n + 2 + np.arange(c)
+    np.testing.assert_allclose(-force[ends], system.cables.forces(x[:n], tips)[0], atol=1e-4)
+    # The anchor of a junction begins there and moves with its tip.
+    anchors = junctions + 3
+    np.testing.assert_allclose(start[anchors], start[junctions])
+    moves = case.closed.papillary_tips - case.frames[0].papillary_tips
+    found = [float(e.text) for e in root.find("MeshData/NodeData[@name='tips_z']")]
+    assert found == pytest.approx(moves[[0, 1, 0, 0, 0], 2])
 
 
 def test_averages_are_averages(root):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 from mvest.errors import GeometryError, InputError
@@ -14,12 +15,13 @@ from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slic
 from mvest.simulation.arrival import POSE, SHIFT, ArrivalSettings, arrive
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import areas
-from tests.cases.folders import template_case
+from tests.cases.folders import template_case, tree_case
 
 pyvista = pytest.importorskip("pyvista", reason="needs PyVista, which comes with the extra viz")
 
 OPTIONS = SlicerheartOptions(pressure_mmHg=120.0)
 TRUTH = template_case(64, 16)
+TREES = tree_case(64, 16)
 SPHERE = pyvista.Sphere(radius=10.0)
 
 
@@ -139,6 +141,50 @@ def test_folders_without_phases_are_the_open_and_the_closed_frame(folder, case, 
     refused(tmp_path / "MS", "are the frames exchanged?", options=options)
 
 
+def in_scallops(folder, gap_mm):
+    """Cut the posterior leaflets into P1, P2 and P3, with triangles of their own and a gap."""
+    for file in folder.glob("*_atrial_mitral_posterior_leaflet.vtk"):
+        whole = pyvista.read(file)
+        along = (whole.points - whole.points.mean(axis=0)) @ POSE[:, 0]
+        low, high = np.quantile(along, [0.35, 0.65])
+        name = file.name.replace("posterior_leaflet", "posterior_leaflet_P{}")
+        for number, (start, end) in enumerate(((-99, low), (low, high), (high, 99)), 1):
+            whole.point_data["side"] = np.abs(along - (start + end) / 2) - (end - start) / 2
+            part = whole.clip_scalar(scalars="side", value=-gap_mm / 2).triangulate().clean()
+            if number == 2:
+                part = part.subdivide(1, "linear").flip_faces()
+            write_model(part, folder / name.format(number))
+        file.unlink()
+
+
+def write_model(model, file):
+    model.clear_data()
+    model.save(file)
+    file.write_bytes(
+        re.sub(rb"\n[^\n]*\n", b"\n3D Slicer. SPACE=LPS\n", file.read_bytes(), count=1)
+    )
+
+
+def test_scallops_of_the_posterior_leaflet_are_joined(folder, case):
+    in_scallops(folder, 0.6)
+    found = import_slicerheart(folder, OPTIONS)
+    for frame, expected in zip(found.frames, case.frames, strict=True):
+        assert rms_to(frame, expected.vertices, expected.triangles) < 0.1
+    own, true = (
+        np.bincount(s.region, areas(s.vertices, s.triangles)) for s in (found.surface, case.surface)
+    )
+    assert own == pytest.approx(true, rel=0.01)
+    assert "MD: posterior leaflet: P1, P2, P3" in found.derived
+    file = next(folder.glob("*_MD_*_P2.vtk"))
+    shutil.copy(file, file.with_stem(f"{file.stem}_again"))
+    refused(folder, "4 surfaces of the posterior .*, or one of each scallop")
+
+
+def test_scallops_far_apart_are_refused(folder):
+    in_scallops(folder, 4.0)
+    refused(folder, "MD: posterior leaflet: segments of a leaflet, 4.* mm apart", GeometryError)
+
+
 def test_the_atrial_side_is_taken_before_closed_segments(folder, case):
     for file in folder.glob("*_atrial_*"):
         SPHERE.save(file.with_name(file.name.replace("_atrial", "")))
@@ -154,6 +200,69 @@ def refused(folder, words, kind=InputError, options=OPTIONS):
         import_slicerheart(folder, options)
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(str(folder))
+
+
+@pytest.fixture
+def fem(exported, tmp_path):
+    """A folder of ValveFemExport with branching chords: shells, and lines with their own points."""
+    folder = tmp_path / "fem"
+    folder.mkdir()
+    for file in exported.glob("*_MD_atrial_*"):
+        name = re.sub(r".*(mitral_\w+_leaflet)", r"\1_SurfaceModel-fit", file.name)
+        shutil.copy(file, folder / name)
+    table = (exported / "ValveLandmarkPoints.csv").read_text().splitlines(keepends=True)
+    rows = [row for row in table[1:] if ",MD," in row]
+    (folder / "ValveLandmarkPoints.csv").write_text("".join([table[0], *rows]))
+    lines = in_lps(TREES.chordae.ends(TREES.frames[0].papillary_tips))
+    for number, own in enumerate((lines[::2], lines[1::2])):
+        write_lines(own, folder / f"Chords_mesh_-_Region_{number}.vtk")
+    return folder
+
+
+def write_lines(segments, file):
+    cells = np.column_stack(
+        [np.full(len(segments), 2), np.arange(2 * len(segments)).reshape(-1, 2)]
+    )
+    write_model(pyvista.PolyData(segments.reshape(-1, 3), lines=cells), file)
+
+
+def test_branching_chords_of_a_fem_export(fem):
+    found, truth = import_slicerheart(fem, SlicerheartOptions()), TREES.chordae
+    tips, own = found.frames[0].papillary_tips, found.chordae
+    true_tips = in_lps(TREES.frames[0].papillary_tips)
+    assert tips == pytest.approx(true_tips[::-1], abs=1e-3)
+    c, ends = len(truth.insertion), truth.ends(TREES.frames[0].papillary_tips)
+    assert (len(own.insertion), len(own.junction)) == (c, 3)
+    # Each segment is the true one with the same ends, and as long as drawn.
+    away, number = cKDTree(in_lps(ends).reshape(-1, 6)).query(own.ends(tips).reshape(-1, 6))
+    assert away.max() < 1e-3
+    assert sorted(number) == list(range(c + 3))
+    length = np.linalg.norm(np.diff(ends, axis=1)[:, 0], axis=1)
+    assert own.rest_length == pytest.approx(length[number], abs=1e-4)
+    true_family = np.where(number < c, truth.family[number], 0)
+    assert np.mean(own.family == true_family) > 0.95
+    # A trunk is as stiff as its branches, and all trunks as the template's.
+    for junction in range(3):
+        branches = own.axial_stiffness[own.parent == junction].sum()
+        assert own.axial_stiffness[c + junction] == pytest.approx(branches)
+    total = TRUTH.chordae.axial_stiffness.sum()
+    assert own.axial_stiffness[own.parent < 0].sum() == pytest.approx(total)
+    assert any(f"chordae: {c} leaflet ends and 3 branching points" in s for s in found.derived)
+
+
+def test_chords_that_start_elsewhere_or_meet_are_refused(fem):
+    tips = in_lps(TREES.frames[0].papillary_tips)[::-1]
+    moved = SlicerheartOptions(tips=tuple((tips + np.array([3.0, 4.0, 0.0])).ravel()))
+    refused(fem, "chords begin up to 5.0 mm from the papillary tips", options=moved)
+    file, ends = fem / "Chords_mesh_-_Region_0.vtk", TREES.chordae.junction[[0, 2]]
+    write_lines(in_lps(np.stack([ends, TREES.chordae.junction[[1, 1]]], axis=1)), file)
+    refused(fem, "2 chords meet at .*, where others begin; expected one", options=OPTIONS)
+    for file in fem.glob("Chords*"):
+        model = pyvista.read(file)
+        write_lines(model.points.reshape(-1, 2, 3)[:, ::-1], file)
+    refused(
+        fem, r"chords begin up to \d\d\.\d mm", options=SlicerheartOptions(tips=tuple(tips.ravel()))
+    )
 
 
 def test_a_mirrored_valve_is_refused_unless_accepted(folder, case):

@@ -46,7 +46,20 @@ def test_cells_other_than_triangles_are_named(tmp_path):
 def test_unknown_regions_are_named(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(InputError, match=r"for the region 'AML'; .*name them anterior and post"):
-        read_regions({"AML": tmp_path / "a.obj"}, REGIONS)
+        read_regions({"AML": [tmp_path / "a.obj"]}, REGIONS)
+
+
+def test_objects_of_several_names_are_one_region(tmp_path):
+    parts = {"P1": (POINTS, TRIANGLES[:1]), "A": (POINTS, TRIANGLES[1:2])}
+    path = write_parts(tmp_path / "a.glb", parts | {"posterior": (POINTS, TRIANGLES[2:])})
+    regions = {"A": "anterior", "P1": "posterior"}
+    found = read_regions(path, regions)
+    names = [(groups, region) for groups, region in zip(found.groups, found.region, strict=True)]
+    assert sorted(names) == [("A", 0), ("P1", 1), ("posterior", 1)]
+    with pytest.raises(
+        InputError, match=r"unknown label P1 .*known are anterior, .*A \(anterior\)"
+    ):
+        read_regions(path, {"A": "anterior", 1: "posterior"})
 
 
 def test_nodes_place_what_is_below_them(tmp_path):
