@@ -33,7 +33,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.reading.text import indices, numbers, one_line, read_columns, write_columns
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
-from mvest.valve.anatomy.template import Template, smoothstep
+from mvest.valve.anatomy.template import Template, laid_out, smoothstep
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 
@@ -43,7 +43,6 @@ BRANCH_COLUMNS = ("start", "end")
 MAX_SEGMENTS = 5000
 GENERIC_THICKNESS = {"anterior": 1.32, "posterior": 1.26}
 """mm, the method paper's values (ISBI 2013)."""
-FAMILIES = ("marginal", "basal")
 
 CLOSED_DEPTH = 0.75
 """Depth of the free edge below the annulus, closed over open, if there is no closed frame; the
@@ -392,28 +391,24 @@ def lay_out_chordae(
 ) -> Chordae:
     """Place the chordae of a layout on a valve with two papillary tips ``(2, 3)`` mm.
 
-    Every chord starts at the nearer of the two tips in the reference frame. Its rest length is
-    ``slack`` times its length in the closed frame, and at least ``open_slack`` times that in the
-    open one, as in the template. The closed frame has positions ``(n, 3)`` mm of the reference's
+    Every chord starts at the nearer of the two tips in the reference frame. Rest lengths are those
+    of `mvest.valve.anatomy.template.laid_out`. The closed frame has positions ``(n, 3)`` mm of the reference's
     vertices, or its own coordinates if its vertices do not correspond. The layout is the template's
     for an intended closed frame (`assumed_closure`); for an observed one `SEEN_CLOSURE`, or
     `SEEN_ON_BAND` if the valves are bands. InputError if there are not two tips.
     """
     if len(open_tips) != 2 or len(closed_tips) != 2:
         raise InputError(f"{len(open_tips)} papillary tips; the layout of chordae needs two")
-    phi, s, family, _ = Template(TemplateParameters(chordae=layout)).chord_places()
-    corners, weights = open_valve.locate(phi, s)
+    places = Template(TemplateParameters(chordae=layout)).chord_places()
+    corners, weights = open_valve.locate(places.phi, places.s)
     insertion = _weighted(open_valve.vertices, corners, weights)
     if isinstance(closed_valve, np.ndarray):
         closed = _weighted(closed_valve, corners, weights)
     else:
-        closed = closed_valve.position(phi, s)
-    reach = np.linalg.norm(insertion[:, None] - open_tips, axis=2)
+        closed = closed_valve.position(places.phi, places.s)
+    reach = np.linalg.norm((places.beyond @ insertion)[:, None] - open_tips, axis=2)
     tip = np.argmin(reach, axis=1)
-    slack = np.where(family == 0, layout.marginal_slack, layout.basal_slack)
-    rest_length = np.maximum(
-        slack * np.linalg.norm(closed - closed_tips[tip], axis=1),
-        layout.open_slack * reach.min(axis=1),
-    )
-    stiffness = np.where(family == 0, layout.marginal_stiffness, layout.basal_stiffness)
-    return Chordae(tip, insertion, family, FAMILIES, rest_length, stiffness, layout.toe_strain)
+    branches = np.flatnonzero(places.parent >= 0)
+    tip[branches] = tip[len(places.phi) + places.parent[branches]]
+    ends, tips = (insertion, closed), (open_tips, closed_tips)
+    return laid_out(places._replace(tip=tip), layout, ends, tips)

@@ -283,7 +283,7 @@ def moving_valve(
     valve is beyond the limits of the settings.
     """
     layout, count = ValveLayout(settings.columns, settings.rows), len(vertices)
-    phi, s, _, tip = drawn.template.chord_places()
+    places = drawn.template.chord_places()
     valve = MovingValve(
         name=drawn.name,
         layout=layout,
@@ -291,9 +291,9 @@ def moving_valve(
         vertices=np.stack(vertices),
         tips=np.stack(tips),
         thickness=drawn.template.thickness(layout.phi, layout.s),
-        chord_phi=np.mod(phi, 360.0),
-        chord_s=s,
-        chord_tip=tip,
+        chord_phi=np.mod(places.phi, 360.0),
+        chord_s=places.s,
+        chord_tip=places.tip[: len(places.phi)],
     )
     check_motion(valve, closed, settings.limits)
     return valve

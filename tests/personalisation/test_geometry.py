@@ -27,7 +27,9 @@ from mvest.personalisation.geometry import (
 from mvest.personalisation.model import CaseClosure, contact_annulus
 from mvest.personalisation.sources import ClosedValve, geometry_sources, sample_frames
 from mvest.problem.registration import RegisteredModel
+from mvest.valve.geometry.proximity import closest_points
 from tests.cases.test_folder import corresponding
+from tests.closure.branching import branching
 from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, model_of
 
 NONE = NuisanceGeometry(
@@ -172,6 +174,30 @@ def test_rest_lengths_change_as_chordae_laid_out_on_other_frames(lift):
 
     expected = (distance(1e-4) - distance(-1e-4)) / (2e-4 * distance(0.0))
     np.testing.assert_allclose(rest_lengths_by_tips(case, move)[0], expected, atol=1e-7)
+
+
+def test_rest_lengths_of_trees_change_as_the_chords_through_them():
+    straight = replace(corresponding(40, 12), chordae_follow=True)
+    tips = straight.frame(Role.REFERENCE).papillary_tips
+    chordae = branching(straight.chordae, tips)
+    case = replace(straight, chordae=chordae)
+    # Leaflets that move away from the tips by a hundredth of the chords' length.
+    frame = case.frame(Role.CLOSED)
+    place = closest_points(chordae.insertion, case.surface.vertices, case.surface.triangles)
+    closed = place.interpolate(frame.vertices, case.surface.triangles)
+    away = 0.01 * (closed - np.asarray(frame.papillary_tips)[chordae.end_tip])
+    opened = 0.01 * (chordae.insertion - np.asarray(tips)[chordae.end_tip])
+    (same,) = rest_lengths_by_ends(case, opened[None], away[None])
+    np.testing.assert_allclose(same, np.full(len(chordae), 0.01), rtol=1e-12)
+    # Only those through the first chord change by that: its branch in full, trunks by their share.
+    one = np.zeros((1, len(away), 1))
+    one[0, 0] = 1.0
+    (found,) = rest_lengths_by_ends(case, one * opened, one * away)
+    own = np.flatnonzero(chordae.paths[0])
+    shared = chordae.paths[: len(away), own].sum(axis=0)
+    np.testing.assert_allclose(found[own], 0.01 / shared, rtol=1e-12)
+    assert sorted(shared) == [1, 2, 4]
+    assert np.all(np.delete(found, own) == 0)
 
 
 def test_columns_of_a_displaced_valve_are_by_the_errors_that_displaced_it():

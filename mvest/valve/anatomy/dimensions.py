@@ -10,10 +10,8 @@ from dataclasses import dataclass, fields, replace
 from operator import attrgetter
 from typing import Any, TypeVar, cast
 
-import numpy as np
-
 from mvest.errors import InputError
-from mvest.quantities import Angle, Factor, Length, Place, Share, Stiffness, Thickness
+from mvest.quantities import Angle, Count, Factor, Length, Place, Share, Stiffness, Thickness
 
 Group = TypeVar("Group")
 
@@ -22,26 +20,20 @@ Group = TypeVar("Group")
 class AnnulusDimensions:
     """The annulus: an ellipse with a flatter anterior half, bent to a saddle.
 
-    Attributes
-    ----------
-    commissural_half_axis, anteroposterior_half_axis : float
-    saddle_height : float
-        Extent along the valve's axis.
-    anterior_flattening : float
-        Relative shortening of the anterior half axis.
-    commissure_angle : float
-        Parametric angle of the commissures above the x axis.
-    commissural_contraction, anteroposterior_contraction : float
-        Relative shortening of the annulus until the valve is closed.
+    Sources. Diameters of normal annuli by three-dimensional echocardiography: 24 ± 3 to 29 ± 3 and
+    30.8 ± 4.4 mm anteroposterior, 35 ± 5 to 39 ± 4 mm commissural; height 5.9 to 6.8 mm, and 0.15
+    to 0.25 of the commissural diameter (Salgo et al. 2002, Circulation 106:711) [recalled]. The
+    open frame is the last one before closure, so that most of the contraction lies behind it.
     """
 
-    commissural_half_axis: Length = 18.0
-    anteroposterior_half_axis: Length = 14.0
-    saddle_height: Place = 6.5
-    anterior_flattening: Share = 0.08
-    commissure_angle: Angle = 19.6
-    commissural_contraction: Share = 0.008
-    anteroposterior_contraction: Share = 0.064
+    commissural_diameter: Length = 36.0
+    anteroposterior_diameter: Length = 28.0
+    saddle_height: Place = 8.0  #: extent along the valve's axis
+    commissure_angle: Angle = 22.0  #: parametric angle of the commissures above the x axis
+    #: relative shortening of the annulus until the valve is closed
+    commissural_contraction: Share = 0.01
+    anteroposterior_contraction: Share = 0.02
+    saddle_deepening: Share = 0.12  #: relative increase of the height until then
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,71 +42,46 @@ class LeafletDimensions:
 
     length: Length  #: from annulus to free edge in the middle
     thickness: Thickness  #: of the half next to the annulus
-    #: exponent of the sine by which the length decreases towards the commissures
-    length_exponent: Factor = 1.2
+    belly: Share  #: depth of its bulge into the lumen, over its length
 
 
 @dataclass(frozen=True, slots=True)
 class LeafletPair:
     """Both leaflets.
 
-    Attributes
-    ----------
-    anterior, posterior : LeafletDimensions
-    commissural_length : float
-        From annulus to free edge at the commissures.
-    belly_depth : float
-        Depth of a leaflet's belly over its length.
-    edge_thinning : float
-        Thickness at the free edge over that next to the annulus.
-    fibre_turn : float
-        Share of the anterior leaflet's angle, at each commissure, over which its fibres turn from
-        parallel to perpendicular to the annulus.
+    The posterior leaflet has three scallops. Between them it is shorter by the `indentation`. Each
+    scallop of the open valve bulges away from the lumen, and into the atrium when it is closed.
+    Lengths of the anterior leaflet are 20 to 25 mm, of the middle scallop 10 to 14 mm [recalled].
+    Thickness is that of the paper.
     """
 
-    anterior: LeafletDimensions = LeafletDimensions(24.0, 1.32)
-    posterior: LeafletDimensions = LeafletDimensions(18.8, 1.26)
-    commissural_length: Length = 11.0
-    belly_depth: Share = 0.04
-    edge_thinning: Share = 0.75
+    anterior: LeafletDimensions = LeafletDimensions(24.0, 1.32, 0.08)
+    posterior: LeafletDimensions = LeafletDimensions(13.0, 1.26, 0.12)
+    commissural_length: Length = 8.5  #: from annulus to free edge at the commissures
+    indentation: Share = 0.2  #: of the length
+    scallop_bulge: Share = 0.15  #: depth of a scallop's bulge over its length
+    edge_thinning: Share = 0.75  #: thickness at the free edge over that next to the annulus
+    #: share of the anterior leaflet's angle, at each commissure, over which its fibres turn from
+    #: parallel to perpendicular to the annulus
     fibre_turn: Angle = 0.23
 
 
 @dataclass(frozen=True, slots=True)
 class FreeEdge:
-    """The free edge of the open valve from above: two arcs that meet at the commissures.
+    """The free edges: of the open valve seen from above, and the line on which they meet.
 
-    Attributes
-    ----------
-    half_width : float
-        Half the distance between the commissures.
-    commissural_y : float
-        y of the commissures.
-    anterior_depth, posterior_depth : float
-        Distance of the middles of the arcs from there along y.
-    exponent : float
-        1 gives half ellipses, 2 parabolas that meet at an angle.
+    The line of coaptation is ``y = commissural_y - sag (1 - u^2)``, ``z = -depth - drop u^2`` with
+    ``u = 2 x / width``. It defines the rest lengths of the chordae.
     """
 
-    half_width: Length = 15.5
-    commissural_y: Place = 1.83
-    anterior_depth: Place = 6.5
-    posterior_depth: Place = 10.5
-    exponent: Factor = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class ClosedEdge:
-    """Line on which the free edges are meant to meet; it defines the rest lengths of the chordae.
-
-    The line is ``y = free_edge.commissural_y - sag (1 - u^2)``, ``z = middle_z - drop u^2`` with
-    ``u = x / half_width``.
-    """
-
-    half_width: Length = 13.0
-    sag: Place = 7.19
-    middle_z: Place = -10.9
-    drop: Place = 3.4
+    width: Length = 26.0  #: between the commissures
+    commissural_y: Place = 1.5  #: y of the commissures
+    #: distance of the middle of the open edge from there along y, towards its own annulus
+    anterior_opening: Place = 0.0
+    posterior_opening: Place = 7.0
+    sag: Place = 7.5
+    depth: Place = 4.0
+    drop: Place = 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,26 +89,42 @@ class PapillaryPlace:
     """Positions of the papillary tips."""
 
     #: (x, y, z), the tip at positive x; the other one is its mirror image
-    tip: tuple[Place, Place, Place] = (16.0, -0.24, -25.0)
+    tip: tuple[Place, Place, Place] = (16.0, -0.5, -25.0)
     #: (x, y, z), displacement of this tip after the chordae got their lengths; the other tip moves
     #: as its mirror image. The chordae tether the leaflets then, but are never taut in the open
     #: valve.
     displacement: tuple[Place, Place, Place] = (0.0, 0.0, 0.0)
 
 
+FAMILIES = ("marginal", "basal", "strut")
+"""Families of chordae."""
+
+
 @dataclass(frozen=True, slots=True)
 class ChordLayout:
-    """Insertions of the chordae in material coordinates of one half; the other half is mirrored.
+    """The chordae of one half of the valve in material coordinates; the other half is mirrored.
+
+    Angles are degrees from the commissure, positive on the anterior leaflet. Marginal chordae
+    branch into fans that insert next to the free edge; basal chordae and the strut chordae of the
+    anterior leaflet insert at its body. With 7 fans, 4 basal chordae and a strut chord, each tip
+    sends out 12 chordae: 24 in all, as in human valves (25: 9 anterior, 14 posterior, 2
+    commissural; Lam et al. 1970, Circulation 41:449) [recalled].
 
     Attributes
     ----------
-    marginal_phi : tuple of float
-        Degrees from the commissure, positive on the anterior leaflet, at ``s = marginal_s``.
-    basal : tuple of (float, float)
-        (phi, s) of the basal chordae.
-    marginal_s : float
-    marginal_stiffness, basal_stiffness : float
-        Axial stiffness EA, N.
+    marginal : tuple of float
+        Middles of the fans.
+    branches : int
+        Branches of a fan; 1 for straight marginal chordae.
+    fan_width : float
+        Angle between the outermost branches.
+    basal, strut : tuple of (float, float)
+        Places (angle, s).
+    stiffness : tuple of three float
+        Axial stiffness EA (N) of marginal trunks, basal and strut chordae. Branches share that of
+        their trunk. Moduli and sections: 40 MPa and 0.3 to 0.4 mm² marginal, 22 MPa and 0.6 to 0.8
+        mm² basal (Kunzelman and Cochran 1990) [recalled]; a trunk of three branches has their
+        sections together, a strut chord 1.6 mm².
     marginal_slack, basal_slack : float
         Rest length over the distance to the intended closed position.
     open_slack : float
@@ -159,24 +142,33 @@ class ChordLayout:
         If there is no chord, an insertion is incomplete, a range empty or a factor not positive.
     """
 
-    marginal_phi: tuple[Angle, ...] = tuple(np.linspace(-87.0, 88.0, 14).round(3).tolist())
-    basal: tuple[tuple[Angle, Angle], ...] = ((-60.0, 0.5), (50.0, 0.55), (75.0, 0.55))
-    marginal_s: Share = 0.97
-    marginal_stiffness: Stiffness = 20.0
-    basal_stiffness: Stiffness = 16.0
+    marginal: tuple[Angle, ...] = (-78.0, -52.0, -26.0, 0.0, 26.0, 52.0, 78.0)
+    branches: Count = 3
+    fan_width: Angle = 17.0
+    basal: tuple[tuple[Angle, Share], ...] = ((-58.0, 0.5), (-12.0, 0.5), (75.0, 0.5))
+    strut: tuple[tuple[Angle, Share], ...] = ((52.0, 0.55),)
+    stiffness: tuple[Stiffness, Stiffness, Stiffness] = (40.0, 16.0, 35.0)
     marginal_slack: Factor = 0.985
-    basal_slack: Factor = 1.03
+    basal_slack: Factor = 1.02
     open_slack: Factor = 1.035
     toe_strain: Share = 0.015
     elongated: tuple[tuple[Angle, Angle, Angle], ...] = ()
     absent: tuple[tuple[Angle, Angle], ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.marginal_phi and not self.basal:
+        if not (self.marginal or self.basal or self.strut):
             raise InputError("a chord layout needs at least one chord")
-        for k, place in enumerate(self.basal):
-            if len(place) != 2:
-                raise InputError(f"basal chord {k} is {place}, expected (phi, s)")
+        if len(self.stiffness) != len(FAMILIES) or not min(self.stiffness) > 0:
+            raise InputError(
+                f"stiffness of chordae {self.stiffness}, expected one > 0 for each of "
+                f"{', '.join(FAMILIES)}"
+            )
+        if self.branches < 1:
+            raise InputError(f"branches of a marginal chord = {self.branches}, expected >= 1")
+        for name in ("basal", "strut"):
+            for k, place in enumerate(getattr(self, name)):
+                if len(place) != 2:
+                    raise InputError(f"{name} chord {k} is {place}, expected (phi, s)")
         for elongation in self.elongated:
             if len(elongation) != 3 or not (elongation[0] < elongation[1] and elongation[2] > 0):
                 raise InputError(
@@ -189,16 +181,15 @@ class ChordLayout:
 
 
 POSITIVE = (
-    "annulus.commissural_half_axis",
-    "annulus.anteroposterior_half_axis",
+    "annulus.commissural_diameter",
+    "annulus.anteroposterior_diameter",
     "leaflets.anterior.length",
     "leaflets.anterior.thickness",
     "leaflets.posterior.length",
     "leaflets.posterior.thickness",
     "leaflets.commissural_length",
     "leaflets.edge_thinning",
-    "free_edge.half_width",
-    "closed_edge.half_width",
+    "free_edge.width",
 )
 
 
@@ -216,7 +207,6 @@ class TemplateParameters:
     annulus: AnnulusDimensions = AnnulusDimensions()
     leaflets: LeafletPair = LeafletPair()
     free_edge: FreeEdge = FreeEdge()
-    closed_edge: ClosedEdge = ClosedEdge()
     papillary: PapillaryPlace = PapillaryPlace()
     chordae: ChordLayout = ChordLayout()
 

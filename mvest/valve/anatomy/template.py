@@ -14,16 +14,49 @@ papillary tips lie at negative z. All lengths are mm.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.dimensions import FAMILIES, ChordLayout, TemplateParameters
 from mvest.valve.anatomy.valve import Chordae, Motion, Valve, band_grid, sampled_valve
 
 ANTERIOR, POSTERIOR = 0, 1
 REGIONS = ("anterior", "posterior")
+
+FLATTENING = 0.10
+"""Relative shortening of the anterior half of the annulus."""
+LENGTH_EXPONENT = (1.2, 0.8)
+"""Exponents of the sine by which leaflets shorten towards the commissures [choice]."""
+EDGE_EXPONENT = (2.0, 1.2)
+"""Exponents of the sine of the open edges from above: 1 is half an ellipse, 2 a parabola. The
+orifice has the shape of a D."""
+INDENTATION_ANGLE, INDENTATION_WIDTH = 32.0, 14.0
+"""Degrees from the middle of the posterior leaflet to the indentations between its scallops, and
+half their width [choice]."""
+MARGINAL_S = 0.97
+"""Coordinate s at which marginal chordae insert."""
+BRANCHING = 0.65
+"""Share of the way from the papillary tip at which marginal chordae branch [choice]."""
+
+
+class ChordPlaces(NamedTuple):
+    """Places of chordae in material coordinates, with the segments of `Chordae`."""
+
+    phi: FloatArray  #: ``(c,)`` degrees, of the leaflet ends
+    s: FloatArray  #: (c,)
+    family: IntArray  #: ``(k,)`` index into `FAMILIES`
+    tip: IntArray  #: ``(k,)``
+    parent: IntArray  #: ``(k,)``
+
+    @property
+    def beyond(self) -> FloatArray:
+        """Weights ``(k, c)`` of the mean of the leaflet ends beyond the end of each segment."""
+        c = len(self.phi)
+        trunks = self.parent[:c] == np.arange(len(self.parent) - c)[:, None]
+        return np.concatenate([np.eye(c), trunks / trunks.sum(axis=1, keepdims=True)])
 
 
 def smoothstep(x: FloatArray) -> FloatArray:
@@ -66,12 +99,12 @@ class Template:
         """Annulus points ``(k, 3)`` in the reference frame."""
         p = self.parameters.annulus
         theta = self._annulus_angle(phi)
-        half = p.anteroposterior_half_axis
-        half_y = np.where(np.sin(theta) > 0, half * (1 - p.anterior_flattening), half)
+        posterior = p.anteroposterior_diameter / (2 - FLATTENING)
+        half = np.where(np.sin(theta) > 0, (1 - FLATTENING) * posterior, posterior)
         return np.stack(
             [
-                p.commissural_half_axis * np.cos(theta),
-                half_y * np.sin(theta),
+                0.5 * p.commissural_diameter * np.cos(theta),
+                half * np.sin(theta),
                 -0.5 * p.saddle_height * np.cos(2 * theta),
             ],
             axis=-1,
@@ -85,14 +118,41 @@ class Template:
         posterior = np.pi - c + (np.pi + 2 * c) * (phi - 180.0) / 180.0
         return np.where(phi <= 180.0, anterior, posterior)
 
-    def length(self, phi: FloatArray) -> FloatArray:
-        """Leaflet length ``(k,)``."""
+    def _length(self, phi: FloatArray) -> FloatArray:
+        """Leaflet length ``(k,)`` without indentations."""
         p = self.parameters.leaflets
         sine, edge = np.sin(np.deg2rad(phi)), p.commissural_length
-        a, b = p.anterior, p.posterior
-        rise_a = (a.length - edge) * np.maximum(sine, 0) ** a.length_exponent
-        rise_b = (b.length - edge) * np.maximum(-sine, 0) ** b.length_exponent
+        rise_a = (p.anterior.length - edge) * np.maximum(sine, 0) ** LENGTH_EXPONENT[0]
+        rise_b = (p.posterior.length - edge) * np.maximum(-sine, 0) ** LENGTH_EXPONENT[1]
         return edge + rise_a + rise_b
+
+    def _indented(self, phi: FloatArray) -> FloatArray:
+        """Share ``(k,)`` of its length that a leaflet has left, 1 between the indentations."""
+        away = (np.abs(np.mod(phi, 360.0) - 270.0) - INDENTATION_ANGLE) / INDENTATION_WIDTH
+        return 1 - self.parameters.leaflets.indentation * np.maximum(1 - away**2, 0.0) ** 3
+
+    def length(self, phi: FloatArray) -> FloatArray:
+        """Leaflet length ``(k,)``."""
+        return self._length(phi) * self._indented(phi)
+
+    def _belly(self, phi: FloatArray) -> FloatArray:
+        """Depth ``(k,)`` of the leaflets' bulge into the lumen, over their length."""
+        p = self.parameters.leaflets
+        share = smoothstep(0.5 + np.sin(np.deg2rad(phi)) / (2 * np.sin(np.deg2rad(25.0))))
+        return (
+            p.posterior.belly
+            + (p.anterior.belly - p.posterior.belly) * share
+            - (p.scallop_bulge * self._scallops(phi))
+        )
+
+    @staticmethod
+    def _scallops(phi: FloatArray) -> FloatArray:
+        """Wave ``(k,)`` from -1 at the indentations to 1 in the middle of each scallop."""
+        away = np.abs(np.mod(phi, 360.0) - 270.0)
+        outer = (away - INDENTATION_ANGLE) / (90.0 - INDENTATION_ANGLE)
+        turn = np.where(away < INDENTATION_ANGLE, 0.5 + 0.5 * away / INDENTATION_ANGLE, outer)
+        wave = -np.cos(2 * np.pi * turn) * smoothstep((90.0 - away) / 20.0)
+        return np.where(away < 90.0, wave, 0.0)
 
     def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
         """Thickness ``(k,)``, blended over 20 degrees to each side of a commissure."""
@@ -108,14 +168,12 @@ class Template:
         p = self.parameters.free_edge
         angle = np.linspace(0, 2 * np.pi, 2881)
         phi = np.empty_like(angle)
-        for low, high, depth in (
-            (0.0, np.pi, p.anterior_depth),
-            (np.pi, 2 * np.pi, p.posterior_depth),
-        ):
-            part = (angle >= low - 1e-12) & (angle <= high + 1e-12)
+        for leaflet, depth in enumerate((p.anterior_opening, p.posterior_opening)):
+            low, q = leaflet * np.pi, EDGE_EXPONENT[leaflet]
+            part = (angle >= low - 1e-12) & (angle <= low + np.pi + 1e-12)
             a = angle[part]
-            sine, q = np.abs(np.sin(a)), p.exponent
-            speed = np.hypot(p.half_width * sine, depth * q * sine ** (q - 1) * np.cos(a))
+            sine = np.maximum(np.abs(np.sin(a)), 1e-9)
+            speed = np.hypot(0.5 * p.width * sine, depth * q * sine ** (q - 1) * np.cos(a))
             arc = np.concatenate([[0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(a))])
             phi[part] = np.rad2deg(low) + 180.0 * arc / arc[-1]
         return phi, angle
@@ -125,9 +183,10 @@ class Template:
         p = self.parameters.free_edge
         angle = np.interp(np.mod(phi, 360.0), *self._edge_table)
         sine = np.sin(angle)
-        depth = np.where(sine > 0, p.anterior_depth, -p.posterior_depth)
-        y = p.commissural_y + depth * np.abs(sine) ** p.exponent
-        return np.stack([p.half_width * np.cos(angle), y], axis=-1)
+        rise = p.anterior_opening * np.maximum(sine, 0.0) ** EDGE_EXPONENT[0]
+        fall = p.posterior_opening * np.maximum(-sine, 0.0) ** EDGE_EXPONENT[1]
+        y = p.commissural_y + rise - fall
+        return np.stack([0.5 * p.width * np.cos(angle), y], axis=-1)
 
     def position(
         self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
@@ -146,7 +205,7 @@ class Template:
         edge = self._edge_xy(phi)
         across = edge - a[..., :2]
         reach = np.linalg.norm(across, axis=-1)
-        length = self.length(phi)
+        length, s = self._length(phi), s * self._indented(phi)
         if np.any(length <= reach):
             k = int(np.argmax(reach - length))
             raise GeometryError(
@@ -161,7 +220,7 @@ class Template:
         belly = np.concatenate(
             [inward * (drop / length)[..., None], (reach / length)[..., None]], axis=-1
         )
-        depth = self.parameters.leaflets.belly_depth * length * 4 * s * (1 - s)
+        depth = self._belly(phi) * length * 4 * s * (1 - s)
         return a + s[..., None] * span + depth[..., None] * belly
 
     def tangents(self, phi: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -220,58 +279,67 @@ class Template:
         """The tips ``(2, 3)`` mm that define the lengths of the chordae."""
         return _mirrored(self.parameters.papillary.tip)
 
-    def chord_places(self) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
-        """``phi`` (degrees), ``s``, family (0 marginal, 1 basal) and tip ``(c,)`` of the chordae.
-
-        Absent ones are left out; InputError if none is left.
-        """
+    def chord_places(self) -> ChordPlaces:
+        """Places of the chordae of both halves; InputError if none is left by `absent`."""
         layout = self.parameters.chordae
-        marginal = [(phi, layout.marginal_s, 0) for phi in layout.marginal_phi]
-        basal = [(phi, s, 1) for phi, s in layout.basal]
-        phi, s, family = (np.array(v, dtype=float) for v in zip(*marginal, *basal, strict=True))
-        phi = np.concatenate([phi, 180.0 - phi])
-        s, family = np.tile(s, 2), np.tile(family, 2).astype(np.int64)
-        tip = np.repeat([0, 1], len(family) // 2)
-        present = np.ones(len(phi), dtype=bool)
-        for start, end in layout.absent:
-            present &= ~_between(phi, start, end)
-        if not np.any(present):
+        turns = np.linspace(-0.5, 0.5, layout.branches) * layout.fan_width
+        if layout.branches == 1:
+            turns = np.zeros(1)
+        groups = [
+            (0, [(middle + turn, MARGINAL_S) for turn in turns]) for middle in layout.marginal
+        ]
+        for family, places in ((1, layout.basal), (2, layout.strut)):
+            groups += [(family, [place]) for place in places]
+        ends: list[tuple[float, float, int, int, int]] = []
+        trunks: list[tuple[int, int]] = []
+        for tip in (0, 1):
+            for family, own in groups:
+                at = np.array([180.0 - phi if tip else phi for phi, _ in own])
+                here = np.ones(len(own), dtype=np.bool_)
+                for start, end in layout.absent:
+                    here &= ~_between(at, start, end)
+                parent = len(trunks) if here.sum() > 1 else -1
+                if parent >= 0:
+                    trunks.append((family, tip))
+                left = zip(at[here], np.array(own)[here, 1], strict=True)
+                ends += [(phi, s, family, tip, parent) for phi, s in left]
+        if not ends:
             raise InputError(f"chordae absent at {layout.absent}: none is left")
-        phi, s, family, tip = phi[present], s[present], family[present], tip[present]
-        return phi, s, family, tip
+        phi, s, family, tip, parent = map(np.array, zip(*ends, strict=True))
+        above = np.array(trunks, dtype=np.int64).reshape(-1, 2)
+        return ChordPlaces(
+            phi,
+            s,
+            np.concatenate([family, above[:, 0]]),
+            np.concatenate([tip, above[:, 1]]),
+            np.concatenate([parent, np.full(len(above), -1)]),
+        )
 
     def chordae(self) -> Chordae:
         """The chordae of both halves without the absent ones; InputError if none is left."""
-        layout = self.parameters.chordae
-        phi, s, family, tip = self.chord_places()
-        insertion = self.position(phi, s)
-        tips = self.papillary_tips[tip]
-        open_length = np.linalg.norm(insertion - tips, axis=1)
-        target = self._closed_position(phi, s, insertion)
-        slack = np.where(family == 0, layout.marginal_slack, layout.basal_slack)
-        closed_length = np.linalg.norm(target - self._intended_tips[tip], axis=1)
-        rest = np.maximum(slack * closed_length, layout.open_slack * open_length)
-        for start, end, factor in layout.elongated:
-            rest[_between(phi, start, end)] *= factor
-        stiffness = np.where(family == 0, layout.marginal_stiffness, layout.basal_stiffness)
-        return Chordae(
-            tip, insertion, family, ("marginal", "basal"), rest, stiffness, layout.toe_strain
-        )
+        places = self.chord_places()
+        insertion = self.position(places.phi, places.s)
+        goal = self._closed_position(places.phi, places.s, insertion)
+        tips = self.papillary_tips, self._intended_tips
+        return laid_out(places, self.parameters.chordae, (insertion, goal), tips)
 
     def _closed_position(self, phi: FloatArray, s: FloatArray, rest: FloatArray) -> FloatArray:
         """Intended closed positions: the coaptation line at the free edge, the annulus at s = 0."""
-        opened, closed = self.parameters.free_edge, self.parameters.closed_edge
-        u = np.clip(rest[:, 0] / opened.half_width, -1.0, 1.0)
-        y = opened.commissural_y - closed.sag * (1 - u**2)
-        z = closed.middle_z - closed.drop * u**2
-        edge = np.stack([u * closed.half_width, y, z], axis=-1)
+        p = self.parameters.free_edge
+        u = np.clip(2 * rest[:, 0] / p.width, -1.0, 1.0)
+        y = p.commissural_y - p.sag * (1 - u**2)
+        edge = np.stack([0.5 * p.width * u, y, -p.depth - p.drop * u**2], axis=-1)
         return (1 - s)[:, None] * self.annulus(phi) + s[:, None] * edge
 
     def motion(self, phi: FloatArray) -> Motion:
         """Annulus at ``phi`` and papillary tips from open (phase 0) to closed (phase 1)."""
         p = self.parameters.annulus
         start = self.annulus(phi)
-        end = start * [1 - p.commissural_contraction, 1 - p.anteroposterior_contraction, 1.0]
+        end = start * [
+            1 - p.commissural_contraction,
+            1 - p.anteroposterior_contraction,
+            1 + p.saddle_deepening,
+        ]
         tips = self.papillary_tips
         return Motion(np.array([0.0, 1.0]), np.stack([start, end]), np.stack([tips, tips]))
 
@@ -288,3 +356,60 @@ class Template:
         return sampled_valve(
             self, columns, rows, lambda phi: (self.papillary_tips, self.chordae(), self.motion(phi))
         )
+
+
+def laid_out(
+    places: ChordPlaces,
+    layout: ChordLayout,
+    ends: tuple[FloatArray, FloatArray],
+    tips: tuple[FloatArray, FloatArray],
+) -> Chordae:
+    """Chordae at their places, long enough for an open and a closed valve.
+
+    The rest length of a segment is ``slack`` times its length in the closed valve. A tree is longer
+    where one of its ways from tip to leaflet would otherwise be shorter than ``open_slack`` times
+    that in the open valve. Junctions lie on the lines from the tips to the middles of their fans.
+
+    Parameters
+    ----------
+    places : ChordPlaces
+    layout : ChordLayout
+    ends : two arrays
+        Leaflet ends ``(c, 3)`` mm in the open and the closed valve.
+    tips : two arrays
+        Papillary tips ``(t, 3)`` mm in both.
+    """
+    c, parent, beyond = len(places.phi), places.parent, places.beyond
+    branch = parent >= 0
+    lengths, points = [], []
+    for leaflet, tip in zip(ends, tips, strict=True):
+        root, end = tip[places.tip], beyond @ leaflet
+        end[c:] = root[c:] + BRANCHING * (end[c:] - root[c:])
+        start = np.where(branch[:, None], end[c + parent], root)
+        lengths.append(np.linalg.norm(end - start, axis=1))
+        points.append(end)
+    closed = lengths[1]
+    trunk = np.where(branch[:c], c + parent[:c], 0)
+    ways = [own[:c] + np.where(branch[:c], own[trunk], 0.0) for own in lengths]
+    slack = np.array([layout.marginal_slack, layout.basal_slack, layout.basal_slack])[places.family]
+    least = layout.open_slack * ways[0] / ways[1]
+    tightest = np.concatenate(
+        [least, [least[parent[:c] == j].max() for j in range(len(parent) - c)]]
+    )
+    tightest[:c] = np.where(branch[:c], tightest[trunk], tightest[:c])
+    rest = closed * np.maximum(slack, tightest)
+    at = np.mod(places.phi, 360.0)
+    for begin, stop, factor in layout.elongated:
+        rest[beyond @ _between(at, begin, stop) >= 0.5] *= factor
+    count = np.where(branch, np.bincount(parent[branch], minlength=1)[parent], 1)
+    return Chordae(
+        tip=places.tip,
+        insertion=ends[0],
+        family=places.family,
+        family_names=FAMILIES,
+        rest_length=rest,
+        axial_stiffness=np.array(layout.stiffness)[places.family] / count,
+        toe_strain=layout.toe_strain,
+        junction=points[0][c:],
+        parent=parent,
+    )

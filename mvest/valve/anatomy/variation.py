@@ -88,8 +88,8 @@ def _changed(p: TemplateParameters, z: FloatArray) -> TemplateParameters:
     thickness = np.exp(THICKNESS * z[8])
     tip = np.exp(size) * np.array(p.papillary.tip) + TIP * z[10:13]
     factors = {
-        "annulus.commissural_half_axis": along_x,
-        "annulus.anteroposterior_half_axis": along_y,
+        "annulus.commissural_diameter": along_x,
+        "annulus.anteroposterior_diameter": along_y,
         "annulus.saddle_height": np.exp(size + SADDLE * z[7]),
         "annulus.anteroposterior_contraction": np.exp(CONTRACTION * z[9]),
         "leaflets.anterior.length": np.exp(half + LEAFLET * z[3]),
@@ -97,14 +97,13 @@ def _changed(p: TemplateParameters, z: FloatArray) -> TemplateParameters:
         "leaflets.commissural_length": np.exp(half),
         "leaflets.anterior.thickness": thickness,
         "leaflets.posterior.thickness": thickness,
-        "free_edge.half_width": along_x,
+        "free_edge.width": along_x,
         "free_edge.commissural_y": along_y,
-        "free_edge.anterior_depth": along_y * np.exp(EDGE * z[5]),
-        "free_edge.posterior_depth": along_y * np.exp(EDGE * z[6]),
-        "closed_edge.half_width": along_x,
-        "closed_edge.sag": along_y,
-        "closed_edge.middle_z": np.exp(size),
-        "closed_edge.drop": np.exp(size),
+        "free_edge.anterior_opening": along_y * np.exp(EDGE * z[5]),
+        "free_edge.posterior_opening": along_y * np.exp(EDGE * z[6]),
+        "free_edge.sag": along_y,
+        "free_edge.depth": np.exp(size),
+        "free_edge.drop": np.exp(size),
     }
     values: dict[str, Any] = {
         name: float(attrgetter(name)(p) * factor) for name, factor in factors.items()
