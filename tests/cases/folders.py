@@ -84,16 +84,18 @@ def tree_case(columns=40, rows=12):
 def plain_folder(folder: Path, columns=24, rows=8):
     """Write the surfaces of an open and a closed frame and a table of chordae; returns case.yaml.
 
+    The chordae run straight to the template's insertions, and are as long as its own are to there.
     The fields are as a user would write them: thickness and fibres are left to be derived.
     """
     chordae = Template().chordae()
     folder.mkdir(exist_ok=True)
     save_frames(folder, columns=columns, rows=rows)
     table = ["tip,x,y,z,family,rest_length_mm,stiffness_n"]
-    for k in range(len(chordae)):
+    lengths = chordae.along(chordae.rest_length).tolist()
+    for k, length in enumerate(lengths):
         x, y, z = chordae.insertion[k].tolist()
         family = chordae.family_names[chordae.family[k]]
-        length, stiffness = float(chordae.rest_length[k]), float(chordae.axial_stiffness[k])
+        stiffness = float(chordae.axial_stiffness[k])
         table.append(f"{chordae.tip[k]},{x!r},{y!r},{z!r},{family},{length!r},{stiffness!r}")
     (folder / "chordae.csv").write_text("\n".join(table) + "\n")
     frames = (("open", 0.0, "reference", 0), ("closed", 0.35, "closed", 120.0))
