@@ -33,9 +33,9 @@ def leaflets(layout, closure):
 
 def descending_valve(layout):
     """An anatomy of its own in two open frames, of which the second lies 1 mm lower."""
-    template = Template(TemplateParameters(AnnulusDimensions(17.2, 13.4)))
+    template = Template(TemplateParameters(AnnulusDimensions(34.4, 26.8)))
     valve = template.valve(layout.columns, layout.rows)
-    phi, s, _, tip = template.chord_places()
+    places = template.chord_places()
     vertices = valve.surface.vertices
     return MovingValve(
         "not in any training",
@@ -44,9 +44,9 @@ def descending_valve(layout):
         np.stack([vertices, vertices + np.array([0.0, 0.0, -1.0])]),
         np.stack([valve.papillary_tips] * 2),
         valve.surface.thickness,
-        np.asarray(phi, float),
-        np.asarray(s, float),
-        np.asarray(tip, np.int64),
+        places.phi,
+        places.s,
+        places.tip[: len(places.phi)],
     )
 
 

@@ -24,7 +24,7 @@ TISSUE = {"anterior": mvest.TissueSettings(ratio=2.65), "posterior": mvest.Tissu
 def small_model() -> mvest.ClosureModel:
     """A coarse valve that a low pressure moves in two steps without closing it."""
     template = mvest.Template(
-        mvest.TemplateParameters().changed({"annulus.anteroposterior_half_axis": 13.8})
+        mvest.TemplateParameters().changed({"annulus.anteroposterior_diameter": 27.6})
     )
     protocol = mvest.ClosureProtocol(5.0, ramp=0.1, dt=0.05, end=0.1, equilibrium=False)
     return mvest.ClosureModel(

@@ -8,7 +8,7 @@ import pytest
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
 from mvest.valve.anatomy.dimensions import ChordLayout
-from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.template import MARGINAL_S, Template
 from mvest.valve.anatomy.valve import band_grid
 from tests.cases.folders import band_of, template_case
 from tests.cases.test_folder import assert_equal
@@ -61,14 +61,15 @@ def test_places_do_not_depend_on_where_the_annulus_begins():
 def test_rest_lengths_follow_the_closed_frame_but_never_fall_below_the_open_one():
     band = LeafletBand.of(*cylinder(), anterior=1)
     layout = ChordLayout(
-        marginal_phi=(180.0 / 14 * 3,), basal=((-90.0, 0.5),), marginal_s=1.0, open_slack=1.1,
+        marginal=(180.0 / 14 * 3,), branches=1, basal=((-90.0, 0.5),), strut=(), open_slack=1.1,
         marginal_slack=0.9, basal_slack=2.0,
     )  # fmt: skip
     tips = np.array([[20.0, 0.0, -30.0], [-20.0, 0.0, -30.0]])
     closed, lower = band.vertices * [0.5, 0.5, 1.0], np.array([0.0, 0.0, 5.0])
     chordae = lay_out_chordae(band, tips, closed, tips - lower, layout)
     # phi = 180 - 3/14 180 from the side of 160 degrees: angles 130 and 50, and -90 twice.
-    places = np.array([at_angle(130, 1), at_angle(-90, 0.5), at_angle(50, 1), at_angle(-90, 0.5)])
+    at = MARGINAL_S
+    places = np.array([at_angle(130, at), at_angle(-90, 0.5), at_angle(50, at), at_angle(-90, 0.5)])
     np.testing.assert_allclose(chordae.insertion, places, atol=1e-9)
     np.testing.assert_array_equal(chordae.tip[[0, 2]], [1, 0])
     open_length = np.linalg.norm(places - tips[chordae.tip], axis=1)

@@ -128,7 +128,7 @@ def test_what_no_valve_does_is_refused(limits, vertices, words):
 
 BASES = {
     "one": TemplateParameters(),
-    "other": TemplateParameters().changed({"annulus.anteroposterior_half_axis": 15.0}),
+    "other": TemplateParameters().changed({"annulus.anteroposterior_diameter": 29.5}),
 }
 
 

@@ -98,7 +98,7 @@ VALUES = {
     "name": "patients",
     "patient": {"moduli": {"E_f.anterior": 4.321}},
     "truth": {"values": [4.321]},
-    "valve": {"annulus": {"anteroposterior_half_axis": 13.579}},
+    "valve": {"annulus": {"anteroposterior_diameter": 27.158}},
     "seed": 24680,
     "parameters": ["E_f.anterior"],
     "row": "drawn_24680",

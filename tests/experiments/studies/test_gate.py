@@ -72,7 +72,7 @@ def test_a_verdict_is_looked_up_by_the_anatomy_and_not_by_its_name(tmp_path):
     assert gate_of(settings("prolapse"), path) == "NOT passed on 54 x 6 hex18"
     # Whatever else is configured, the anatomy is the same; a millimetre is another one.
     assert gate_of(settings("template", "mesh.columns=40"), path).startswith("passed")
-    wider = settings("template", "valve.annulus.anteroposterior_half_axis=15.0")
+    wider = settings("template", "valve.annulus.anteroposterior_diameter=29.5")
     assert gate_of(wider, path) == NOT_GATED
     assert gate_of(settings("template"), tmp_path / "none") == NOT_GATED
 

@@ -27,7 +27,7 @@ def made_up_valve() -> MovingValve:
     share = 0.5 * np.linspace(0, 1, FRAMES)[:, None, None]
     inward = np.stack([0 * s, -0.8 * s * still[:, 1], 0.3 * s * still[:, 2]], axis=1)
     tips = valve.papillary_tips + np.array([0.0, 0.0, 2.0]) * share
-    phi = np.array(template.parameters.chordae.marginal_phi)
+    phi = np.array(template.parameters.chordae.marginal)
     phi = np.mod(np.concatenate([phi, 180 - phi]), 360)
     return MovingValve(
         "made up", layout, 0.04 * np.arange(FRAMES), still + share * inward, tips,

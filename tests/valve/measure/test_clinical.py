@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError
-from mvest.valve.anatomy.dimensions import AnnulusDimensions, TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.measure import clinical
@@ -112,10 +112,10 @@ def test_a_saddle_prolapses_over_its_plane_but_does_not_billow(quick):
 
 
 def test_ratios_lengths_and_tips(quick):
-    p = TemplateParameters(AnnulusDimensions(anterior_flattening=0.0))
+    p = TemplateParameters()
     found = measured(p)
     assert found["annulus_sphericity_ratio"] == pytest.approx(
-        p.annulus.anteroposterior_half_axis / p.annulus.commissural_half_axis, 0.02
+        p.annulus.anteroposterior_diameter / p.annulus.commissural_diameter, 0.02
     )
     assert found["tip_separation_mm"] == pytest.approx(2 * p.papillary.tip[0])
     # The longest way from annulus to edge, in the middle of each leaflet.
