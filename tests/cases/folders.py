@@ -9,9 +9,7 @@ import yaml
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.cases.tissue import LeafletBand
 from mvest.exchange.surfaces import write_surface
-from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
-from mvest.valve.anatomy.valve import Chordae
 
 TIPS = [[16.0, -0.24, -25.0], [-16.0, -0.24, -25.0]]
 
@@ -23,14 +21,9 @@ def closing(x, share=1.0):
     return x * (1.0 - share * squeeze)
 
 
-STRAIGHT = Template(TemplateParameters().changed({"chordae.branches": 1})).chordae()
-"""The template's chordae without branches."""
-
-
-def template_case(columns=40, rows=12, branches=3):
+def template_case(columns=40, rows=12):
     """The template, open, closed and held out, with something of its own in every field."""
-    valve = Template(TemplateParameters().changed({"chordae.branches": branches}))
-    valve = valve.valve(columns, rows)
+    valve = Template().valve(columns, rows)
     surface = valve.surface
 
     def frame(name, time, role, pressure, share, corresponds=True):
@@ -60,51 +53,49 @@ def template_case(columns=40, rows=12, branches=3):
     )
 
 
-def branching(chordae, tips, share=(0.6, 0.8, 0.7)):
-    """The chordae with a fork, and one whose first branch forks again.
+def nested(chordae, tips, where=0.4):
+    """The template's chordae with a further branching point, at which the first two fans begin.
 
-    Insertions 0, 1, 2 of tip 0 hang on two junctions, 3 and 4 on another. Each segment has a rest
-    length, a stiffness and a family of its own. ``share`` is that of the way from the tip.
+    ``where`` is its share of the way from the tip to theirs.
     """
-    c, share = len(chordae.insertion), np.array(share)
-    x, own = chordae.insertion, tips[chordae.tip[0]]
-    towards = np.array([x[:3].mean(axis=0), x[:2].mean(axis=0), x[3:5].mean(axis=0)])
-    parent = np.full(c + 3, -1)
-    parent[[0, 1, 2, 3, 4, c + 1]] = [1, 1, 0, 2, 2, 0]
-    trees = Chordae(
-        np.append(chordae.tip, [chordae.tip[0]] * 3),
-        x,
-        np.append(chordae.family, [1, 0, 1]),
-        chordae.family_names,
-        np.ones(c + 3),
-        np.append(chordae.axial_stiffness, [40.0, 30.0, 35.0]),
-        chordae.toe_strain,
-        own + share[:, None] * (towards - own),
-        parent,
+    c, j, own = len(chordae.insertion), len(chordae.junction), tips[chordae.tip[0]]
+    parent = np.append(chordae.parent, -1)
+    parent[[c, c + 1]] = j
+    place = own + where * (chordae.junction[:2].mean(axis=0) - own)
+    trees = replace(
+        chordae,
+        tip=np.append(chordae.tip, chordae.tip[0]),
+        family=np.append(chordae.family, 1),
+        rest_length=np.ones(c + j + 1),
+        axial_stiffness=np.append(chordae.axial_stiffness, 60.0),
+        junction=np.vstack([chordae.junction, place]),
+        parent=parent,
     )
     lengths = np.linalg.norm(np.diff(trees.ends(tips), axis=1)[:, 0], axis=1)
     return replace(trees, rest_length=1.02 * lengths)
 
 
 def tree_case(columns=40, rows=12):
-    """The template's case with `branching` chordae."""
-    case = template_case(columns, rows, branches=1)
-    return replace(case, chordae=branching(case.chordae, case.frames[0].papillary_tips))
+    """The template's case with `nested` chordae."""
+    case = template_case(columns, rows)
+    return replace(case, chordae=nested(case.chordae, case.frames[0].papillary_tips))
 
 
 def plain_folder(folder: Path, columns=24, rows=8):
     """Write the surfaces of an open and a closed frame and a table of chordae; returns case.yaml.
 
+    The chordae run straight to the template's insertions, and are as long as its own are to there.
     The fields are as a user would write them: thickness and fibres are left to be derived.
     """
-    chordae = STRAIGHT
+    chordae = Template().chordae()
     folder.mkdir(exist_ok=True)
     save_frames(folder, columns=columns, rows=rows)
     table = ["tip,x,y,z,family,rest_length_mm,stiffness_n"]
-    for k in range(len(chordae)):
+    lengths = chordae.along(chordae.rest_length).tolist()
+    for k, length in enumerate(lengths):
         x, y, z = chordae.insertion[k].tolist()
         family = chordae.family_names[chordae.family[k]]
-        length, stiffness = float(chordae.rest_length[k]), float(chordae.axial_stiffness[k])
+        stiffness = float(chordae.axial_stiffness[k])
         table.append(f"{chordae.tip[k]},{x!r},{y!r},{z!r},{family},{length!r},{stiffness!r}")
     (folder / "chordae.csv").write_text("\n".join(table) + "\n")
     frames = (("open", 0.0, "reference", 0), ("closed", 0.35, "closed", 120.0))

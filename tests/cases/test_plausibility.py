@@ -11,7 +11,7 @@ from mvest.cases.folder import read_case
 from mvest.cases.plausibility import implausible_values, require_plausible
 from mvest.errors import InputError
 from mvest.observation.errors import SpatialCorrelation
-from tests.cases.folders import branching
+from tests.cases.folders import nested
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "case"
 
@@ -50,7 +50,7 @@ def test_the_example_is_in_order(case):
 def test_a_chord_is_as_long_as_the_way_along_its_branches(case):
     # Its segments are shorter than any chord, its way is about as long as before.
     tips, chordae = case.frame(Role.REFERENCE).papillary_tips, case.chordae
-    trees = branching(chordae, tips, (0.9, 0.95, 0.9))
+    trees = nested(chordae, tips, 0.95)
     assert np.linalg.norm(np.diff(trees.ends(tips), axis=1), axis=2).min() < 1.5
     assert implausible_values(replace(case, chordae=trees)) == ()
 

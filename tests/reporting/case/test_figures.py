@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection, QuadMesh
 
-from mvest.problem.fields import case_fields, chord_fields, valve_fields
+from mvest.problem.fields import as_stored, case_fields, chord_fields, turn_of, valve_fields
 from mvest.reporting.case.drawing import (
     LINE_PIECES,
     leak_of,
@@ -14,7 +14,8 @@ from mvest.reporting.case.drawing import (
 from mvest.reporting.case.figures import case_figure, estimates_figure, frames_figure, shapes_figure
 from mvest.reporting.case.view import states_of
 from mvest.reporting.figures import ATRIUM, SIDE
-from tests.cases.folders import template_case, tree_case
+from tests.closure.branching import branched
+from tests.made_up_closure import VALVE
 from tests.made_up_closure import made_up_case as case_of_frames
 from tests.reporting.case.made_up_case import COLUMNS, made_up_case
 
@@ -130,6 +131,40 @@ def test_every_frame_of_a_case_is_drawn_from_two_sides_on_one_scale(corresponds)
     assert (opened == closed) is corresponds
 
 
+def test_branching_chordae_are_drawn_where_they_follow_tips_and_leaflets():
+    # Stored with a case, in another frame, and turned as the valve is.
+    valve = branched(VALVE)
+    surface, tips = valve.surface, valve.papillary_tips
+    arrays = valve_fields(valve, ["closed"]) | {"tips": np.stack([tips, tips + 1.0])}
+    arrays |= as_stored(chord_fields(valve.chordae, surface.vertices))
+    turned = case_fields(arrays)
+    moves = np.sin(surface.vertices[:, [1, 2, 0]] / 7.0)
+    middle, axes = turn_of(surface.vertices, valve.annulus, surface.triangles, surface.region, tips)
+    points = (surface.vertices + moves - middle) @ axes
+    moved = valve.chordae.moved(np.ones_like(tips), moves[turned.chord_insertion])
+    expected = (moved.ends(tips + 1.0) - middle) @ axes
+    found = turned.chords(points, 1)
+    # Insertions are drawn at the nearest vertex, here within a cell's diagonal.
+    c, on = len(moved.insertion), moved.parent >= 0
+    np.testing.assert_allclose(found[on, 0], expected[on, 0], atol=1e-4)
+    np.testing.assert_allclose(found[~on, 0], expected[~on, 0], atol=1e-4)
+    np.testing.assert_allclose(found[c:, 1], expected[c:, 1], atol=1e-4)
+    assert np.abs(found[:c, 1] - expected[:c, 1]).max() < 2.0
+    # A vertex that was not seen takes away its own segment alone.
+    points[turned.chord_insertion[3]] = np.nan
+    unknown = np.isnan(turned.chords(points, 1)).any(axis=(1, 2))
+    assert np.flatnonzero(unknown).tolist() == [3]
+
+
+def test_frames_of_a_case_show_all_segments_of_branching_chordae():
+    straight = case_of_frames(0.3)
+    tree = replace(straight, chordae=branched(VALVE).chordae)
+    one, other = (
+        len(faces(frames_figure(own, reach_mm=2.0).axes[3]).get_paths()) for own in (straight, tree)
+    )
+    assert (other - one) % (len(tree.chordae) - len(straight.chordae)) == 0 < other - one
+
+
 def test_the_scene_has_the_gap_in_its_place(fields):
     def parts(reach):
         states = states_of(replace(fields, reach_mm=reach, observed=None), NAMES)
@@ -161,34 +196,3 @@ def test_no_leak_is_drawn_of_an_open_or_half_seen_valve(fields):
     for valve, images in ((whole, [0, 1, 1]), (replace(whole, observed=seen), [0, 0, 1])):
         axes = shapes_figure(valve, NAMES).axes[:3]
         assert [len(leaks(panel)) for panel in axes] == images
-
-
-def test_junctions_of_chordae_follow_tips_and_leaflets() -> None:
-    case = tree_case()
-    x, moved = case.surface.vertices, case.closed.vertices
-    tips = [frame.papillary_tips for frame in (case.frames[0], case.closed)]
-    ends = chord_fields(case.chordae, x)["chord_insertion"]
-    chordae = replace(case.chordae, insertion=x[ends])
-    expected = chordae.moved(tips[1] - tips[0], (moved - x)[ends])
-    arrays = {**valve_fields(case.valve, ["closed"]), "rest": x, "tips": tips}
-    fields = case_fields(arrays | chord_fields(case.chordae, x), turned=False)
-    np.testing.assert_allclose(fields.chords(x, 0), chordae.ends(tips[0]), atol=1e-9)
-    np.testing.assert_allclose(fields.chords(moved, 1), expected.ends(tips[1]), atol=1e-9)
-    hidden = moved.copy()
-    hidden[ends[3]] = np.nan  # an unseen vertex
-    unknown = np.isnan(fields.chords(hidden, 1)).any(axis=(1, 2))
-    assert np.flatnonzero(unknown).tolist() == [3]
-    # In a simulation, the ends are points of their own.
-    points = np.concatenate([moved, expected.ends(tips[1])[:, 1]])
-    own = len(moved) + np.arange(len(chordae))
-    own = replace(fields, chord_insertion=own, chord_junction=None)
-    np.testing.assert_allclose(own.chords(points, 1), expected.ends(tips[1]), atol=1e-9)
-
-
-def test_segments_of_branching_chordae_are_drawn() -> None:
-    # Where a frame corresponds and is open.
-    counts = []
-    for case in (template_case(branches=1), tree_case()):
-        figure = frames_figure(case, 1.3)
-        counts.append(len(faces(figure.axes[-3]).get_paths()))
-    assert counts[1] == counts[0] + 3 * LINE_PIECES
