@@ -76,8 +76,8 @@ def band_grid(columns: int, rows: int, sections: Sequence[int] = (0, 1)) -> Band
     """A grid of ``columns x rows`` vertices from annulus to free edge, equal columns per leaflet.
 
     Vertex ``j * columns + i`` is column i, row j: the first row is the annulus, the last one the
-    free edge. Normals of triangles point to the ventricle where phi runs as in the template. Sections
-    are those of `MaterialSurface`.
+    free edge. Normals of triangles point to the ventricle where phi runs as in the template.
+    ``sections`` are those of `MaterialSurface`.
     """
     i, j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows)))
     cell_i, cell_j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows - 1)))
@@ -266,7 +266,7 @@ class Valve:
 
 
 class MaterialSurface(Protocol):
-    """A valve in material coordinates, in which each of n leaflets has ``360 / n`` degrees of phi."""
+    """A valve in material coordinates, where each of n leaflets has ``360 / n`` degrees of phi."""
 
     @property
     def region_names(self) -> tuple[str, ...]:

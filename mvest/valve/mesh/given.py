@@ -1,8 +1,8 @@
 """Sampling and meshing of a valve that is given as a surface.
 
-With material coordinates it is meshed in layers like the template. Alternatively its thickened
-leaflets are meshed with tetrahedra. The mesher keeps neither vertices nor labels, so these are transferred
-by nearness: regions and fibres from the midsurface, pressure faces from the closed surface.
+In material coordinates it is meshed in layers like the template, or its thickened leaflets are
+meshed with tetrahedra. That mesher keeps neither vertices nor labels, so these are transferred by
+nearness: regions and fibres from the midsurface, pressure faces from the closed surface.
 """
 
 from __future__ import annotations
