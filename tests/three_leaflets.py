@@ -1,10 +1,10 @@
 """A made-up valve of three leaflets: the template with a cleft, as a surface and as a case.
 
-The template's posterior leaflet is cut in two: its free edge runs up to a cleft in the middle, where
-the septal leaflet meets the posterior one. The free edges of the closed valve meet in a star.
+The template's posterior leaflet is cut in two: its free edge runs up to a cleft in the middle,
+where the septal leaflet meets the posterior one. The free edges of the closed valve meet in a star.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -38,13 +38,10 @@ class ThreeLeaflets:
 
     sections: tuple[int, ...] = (0, 2, 1)
     region_names: tuple[str, ...] = NAMES
-    whole: Template = Cleft()
+    whole: Template = field(default_factory=Cleft)
 
     def _phi(self, phi):
-        turned = np.interp(
-            np.mod(phi, 360.0), [0.0, 120.0, 240.0, 360.0], [0.0, 180.0, 270.0, 360.0]
-        )
-        return np.where(np.asarray(phi) == 360.0, 360.0, turned)
+        return np.interp(np.mod(phi, 360.0), [0.0, 120.0, 240.0, 360.0], [0.0, 180.0, 270.0, 360.0])
 
     def position(self, phi, s, zeta=0.0):
         """Reference positions ``(..., 3)`` mm."""

@@ -61,8 +61,8 @@ def measure_steps(
         For each step: ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening between the
         thick leaflets along the best annulus normal; ``coaptation`` (mm), the height at mid-valve
         over which two leaflets are within the contact distance (NaN for more); ``intersections``,
-        pairs of intersecting triangles of the leaflets' faces; the largest ``chord strain`` and ``chord
-        force`` (N); ``smallest det F`` at the quadrature points; ``Newton iterations``.
+        pairs of intersecting triangles of the leaflets' faces; the largest ``chord strain`` and
+        ``chord force`` (N); ``smallest det F`` at the quadrature points; ``Newton iterations``.
     """
     valve, system, simulation = model.valve, result.system, result.simulation
     surface, mesh = valve.surface, model.mesh

@@ -3,8 +3,8 @@
 An imported surface has no columns and rows. Its harmonic coordinates provide both: ``s`` runs from
 the annulus (0) to the free edge (1), and ``phi`` (degrees) once around the valve. Each of n
 leaflets has a section of ``360 / n`` degrees between the lines to its neighbours, whatever course
-these take, and the first leaflet has the first section. Layered meshes, contact samples and chordae can
-therefore be laid out on any valve as on the template.
+these take, and the first leaflet has the first section. Layered meshes, contact samples and chordae
+can therefore be laid out on any valve as on the template.
 """
 
 from __future__ import annotations
