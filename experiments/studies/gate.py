@@ -127,7 +127,7 @@ def figure(results: Results) -> Figure | None:
     }
     drawn = Figure(figsize=(11, 8.4), layout="constrained")
     parts: Any = drawn.subfigures(2, 1, height_ratios=[2.2, 1.0])
-    draw_closing(parts[0], results.arrays[name], titles, ("anterior", "posterior"))
+    draw_closing(parts[0], results.arrays[name], titles)
     _draw_curves(parts[1], values, moments, at_rest)
     drawn.suptitle(
         "A simulated valve closing, from the atrium and from the posterior side"

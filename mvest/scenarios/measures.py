@@ -16,8 +16,9 @@ from mvest.errors import InputError
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.scenarios.scenario import plane_of
-from mvest.typing import FloatArray
+from mvest.typing import FloatArray, IntArray
 from mvest.units import mpa_to_mmhg
+from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import intersecting_triangles
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.measure.annulus import measure_annulus
@@ -29,6 +30,11 @@ from mvest.valve.measure.coaptation import (
     orifice_area,
 )
 from mvest.valve.mesh.solid_mesh import embed, jacobian_determinants
+
+
+def _leaflets(surface: LeafletSurface) -> list[IntArray]:
+    """Triangles ``(m, 3)`` of each leaflet."""
+    return [surface.triangles[surface.region == k] for k in range(len(surface.region_names))]
 
 
 def measure_steps(
@@ -54,16 +60,16 @@ def measure_steps(
     list of dict
         For each step: ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening between the
         thick leaflets along the best annulus normal; ``coaptation`` (mm), the height at mid-valve
-        over which the leaflets are within the contact distance; ``intersections``, pairs of
-        intersecting triangles of the leaflets' faces; the largest ``chord strain`` and ``chord
-        force`` (N); ``smallest det F`` at the quadrature points; ``Newton iterations``.
+        over which two leaflets are within the contact distance (NaN for more); ``intersections``,
+        pairs of intersecting triangles of the leaflets' faces; the largest ``chord strain`` and
+        ``chord force`` (N); ``smallest det F`` at the quadrature points; ``Newton iterations``.
     """
     valve, system, simulation = model.valve, result.system, result.simulation
     surface, mesh = valve.surface, model.mesh
     closed_surface = thicken(surface, normals)
     faces = embed(mesh, closed_surface.vertices)
     loading = boundary_loading(system, valve, model.contact_valve, model.settings)
-    one, other = (surface.triangles[surface.region == k] for k in (0, 1))
+    leaflets = _leaflets(surface)
     measures = []
     for time, x in zip(simulation.times, simulation.frames, strict=True):
         middle, outer, loads = model.observed(x), faces(x), loading(time)
@@ -78,7 +84,9 @@ def measure_steps(
             for y in (x, mesh.nodes)
         )
         iterations = sum(len(r.residuals) - 1 for r in simulation.records if r.time <= time + 1e-12)
-        length = coaptation_length(middle, one, other, plane, contact_distance)
+        length = np.nan
+        if len(leaflets) == 2:
+            length = coaptation_length(middle, *leaflets, plane, contact_distance)
         measures.append(
             {
                 "time": float(time),
@@ -188,11 +196,11 @@ Measured = dict[str, float]
 
 * ``gap_mm2``: regurgitant gap, the area within the annulus where lines of sight along its normal
   stay farther than half the contact reach from every leaflet's midsurface;
-  * ``coaptation_length_mm``: length over which the leaflets touch (midsurfaces within the contact
-  reach) in the middle anteroposterior section, the smaller of the two leaflets' values;
-  * ``coaptation_area_mm2``: area over which the leaflets touch, mean of the two leaflets;
-* ``coaptation_height_mm``: that area over the commissural diameter, the mean height of the touching
-  zone across the valve;
+* ``coaptation_area_mm2``: area over which the leaflets touch (midsurfaces within the contact
+  reach), half the sum over all leaflets;
+* of two leaflets also ``coaptation_length_mm``: length over which they touch in the middle
+  anteroposterior section, the smaller of their values; and ``coaptation_height_mm``: the area over
+  the commissural diameter, the mean height of the touching zone across the valve;
 * ``tenting_height_mm``: largest depth of the leaflets below the annulus plane in the middle
   anteroposterior section;
 * ``tenting_volume_mm3``: volume between annulus plane and leaflets;
@@ -208,7 +216,7 @@ leaflet under pressure."""
 
 
 def measure_closed(model: ClosureModel, system: System, x: FloatArray) -> Measured:
-    """Measure one closed two-leaflet valve.
+    """Measure one closed valve.
 
     ``system`` is the model's, at the parameters for which ``x (n, 3)`` mm is in equilibrium.
     """
@@ -216,15 +224,16 @@ def measure_closed(model: ClosureModel, system: System, x: FloatArray) -> Measur
     vertices = model.observed(x)
     annulus = vertices[valve.annulus]
     plane, reach = plane_of(valve, annulus), model.contact_reach_mm
-    pair = surface.triangles[surface.region == 0], surface.triangles[surface.region == 1]
+    leaflets, size = _leaflets(surface), measure_annulus(annulus, plane)
+    area = coaptation_area(vertices, leaflets, reach)
     measures = {
-        "gap_mm2": find_gap(vertices, np.concatenate(pair), annulus, plane, reach).area,
-        "coaptation_length_mm": coaptation_length(vertices, *pair, plane, reach),
-        "coaptation_area_mm2": coaptation_area(vertices, *pair, reach),
+        "gap_mm2": find_gap(vertices, np.concatenate(leaflets), annulus, plane, reach).area,
+        "coaptation_area_mm2": area,
     }
+    if len(leaflets) == 2:
+        measures["coaptation_length_mm"] = coaptation_length(vertices, *leaflets, plane, reach)
+        measures["coaptation_height_mm"] = area / size.commissural_diameter
     measures |= tenting(vertices, surface.triangles, annulus, plane)
-    size = measure_annulus(annulus, plane)
-    measures["coaptation_height_mm"] = measures["coaptation_area_mm2"] / size.commissural_diameter
     measures["ap_diameter_mm"] = size.anteroposterior_diameter
     measures["annulus_circumference_mm"] = size.circumference
     return measures | peak_stress(system, x)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -160,6 +160,7 @@ class Closing:
             "times": simulation.times,
             "triangles": surface.triangles.astype(np.int32),
             "region": surface.region.astype(np.int8),
+            "leaflets": np.array(valve.surface.region_names),
             # Along the atrial faces.
             "annulus": valve.annulus + len(valve.surface.vertices),
             "chord_tip": system.cables.tip,
@@ -182,12 +183,11 @@ def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
     return Closing(model, result, anatomy_of(values).normals(seen["columns"], seen["rows"]))
 
 
-def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequence[str]) -> None:
+def draw_closing(part: Any, path: Path, steps: Mapping[int, str]) -> None:
     """Draw some steps of a closure from the atrium and from the posterior side.
 
     ``part`` is a figure or part of one, ``path`` an ``.npz`` file with `Closing.arrays`. ``steps``
-    maps numbers of steps to titles; the open orifice of the last one is painted. ``names`` are
-    those of the leaflets.
+    maps numbers of steps to titles; the open orifice of the last one is painted.
 
     Raises an `InputError` if the file cannot be read.
     """
@@ -197,7 +197,7 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
 
     try:
         arrays = read_npz(path)
-        count = len(arrays["chord_tip"])
+        count, names = len(arrays["chord_tip"]), arrays["leaflets"].tolist()
         # The ends of the chordae are points of no triangle, with the junctions last.
         shapes = np.concatenate([arrays["frames"], arrays["chord_end"]], axis=1).astype(float)
         own = {
@@ -210,7 +210,7 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path}: no arrays of a closing valve ({error})") from error
     posterior = View("seen from the posterior side", 8.0, -90.0)
-    panels = part.subplots(2, len(steps), height_ratios=[1.0, 1.35])
+    panels = part.subplots(2, len(steps), height_ratios=[1.0, 1.35], squeeze=False)
     colours, last = drawing.leaflet_colours(valve.region), len(shapes) - 1
     for column, (k, title) in zip(panels.T, steps.items(), strict=True):
         for view, axes in zip((ATRIUM, posterior), column, strict=True):

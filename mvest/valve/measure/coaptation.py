@@ -10,6 +10,7 @@ distance at which two of them touch.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -225,26 +226,27 @@ def coaptation_length(
 
 def coaptation_area(
     vertices: FloatArray,
-    first: IntArray,
-    second: IntArray,
+    leaflets: Sequence[IntArray],
     contact_distance: float,
     subdivisions: int = 3,
 ) -> float:
-    """Area (mm²) over which two leaflets touch.
+    """Area (mm²) over which leaflets touch.
 
-    Mean of both leaflets' areas within `contact_distance` of the other and facing it. Each triangle
-    is cut into ``subdivisions²`` equal parts. Parameters as in `coaptation_length`.
+    Half the sum of the leaflets' areas within `contact_distance` of another leaflet and facing it.
+    Each triangle is cut into ``subdivisions²`` equal parts. ``leaflets`` are triangles of each, the
+    other parameters as in `coaptation_length`.
     """
     weights = _part_centroids(subdivisions)
     touching = []
-    for own, other in ((first, second), (second, first)):
+    for k, own in enumerate(leaflets):
+        other = np.concatenate([own[:0], *leaflets[:k], *leaflets[k + 1 :]])
         corners = vertices[own]
         points = np.einsum("qk,mkd->mqd", weights, corners).reshape(-1, 3)
         normals = np.repeat(unit_normals(vertices, own), len(weights), axis=0)
         near = _in_contact(points, normals, vertices, other, contact_distance)
         part = np.repeat(areas(vertices, own) / len(weights), len(weights))
         touching.append(float(part[near].sum()))
-    return 0.5 * (touching[0] + touching[1])
+    return 0.5 * sum(touching)
 
 
 def _part_centroids(n: int) -> FloatArray:

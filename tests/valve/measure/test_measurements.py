@@ -75,8 +75,8 @@ def test_coaptation_of_parallel_plates(shapes):
     touching = coaptation_length(vertices, first, second, plane, contact_distance=1.3)
     assert touching == pytest.approx(10.0, abs=1e-9)
     assert coaptation_length(vertices, first, second, plane, 1.1) == 0.0
-    assert coaptation_area(vertices, first, second, 1.3) == pytest.approx(120.0)
-    assert coaptation_area(vertices, first, second, 1.1) == 0.0
+    assert coaptation_area(vertices, [first, second], 1.3) == pytest.approx(120.0)
+    assert coaptation_area(vertices, [first, second], 1.1) == 0.0
     # Turned to face the same way, the two no longer count as opposing.
     assert coaptation_length(vertices, first, second[:, ::-1], plane, 1.3) == 0.0
 
@@ -91,7 +91,7 @@ def test_coaptation_of_a_wedge(shapes):
     plane = plane_of(shapes.circle(15.0))
     length = coaptation_length(vertices, a, b, plane, contact_distance=1.3)
     assert length == pytest.approx(1.3 / np.sin(2 * alpha), abs=0.05)
-    assert coaptation_area(vertices, a, b, 1.3, subdivisions=6) == pytest.approx(
+    assert coaptation_area(vertices, [a, b], 1.3, subdivisions=6) == pytest.approx(
         12 * 1.3 / np.sin(2 * alpha), rel=0.03
     )
 
