@@ -18,7 +18,7 @@ from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.cables import TiedPoints
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.parameters import Parameter
-from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import Damping, Simulation, Step
 from mvest.mechanics.system import Loads, System
@@ -165,10 +165,45 @@ class ClosureModel:
         values = self._values(m)
         if self._system is None:
             self._system = build_system(
-                self.valve, self.contact_valve, self.mesh, self.settings, values, ties=self.ties
+                self.valve,
+                self.contact_valve,
+                self.mesh,
+                self.settings,
+                values,
+                ties=self.ties,
+                relaxed=self._relaxed(),
             )
         retune(self._system, self.settings, values)
         return self._system, tuple(Parameter(n, values[n]) for n in self.names)
+
+    def _relaxed(self) -> FloatArray | None:
+        """Strain ``(e, q, 6)`` of the valve of `Relaxation`; None if open leaflets have no stress.
+
+        Raises a MaterialError if that valve does not close.
+        """
+        relaxation, protocol = self.settings.relaxation, self.settings.protocol
+        if relaxation is None:
+            return None
+        settings = replace(
+            self.settings,
+            relaxation=None,
+            protocol=replace(protocol, equilibrium=True, curve=()),
+            tissue={
+                r: TissueSettings(t.ratio, t.nu, reading=t.reading)
+                for r, t in self.settings.tissue.items()
+            },
+        )
+        names = tuple(f"E_f.{region}" for region in relaxation.E_f)
+        at, end = np.array(list(relaxation.E_f.values())), self.contact_valve.motion
+        plain = replace(
+            self.fresh(), settings=settings, names=names, fixed={}, guide=None, ties=None
+        )
+        state = HeldState(relaxation.pressure_mmHg, end.annulus[-1], end.papillary_tips[-1])
+        last = plain.rests(at, [state])[-1]
+        if not last.converged:
+            raise MaterialError(f"relaxation: the valve does not close: {failure_of(last)}")
+        solid = plain.tuned(at)[0].solid
+        return solid.evaluate(last.frames[-1], solid.initial_strain(), 0.0).green
 
     @property
     def closed(self) -> ClosedState | None:
