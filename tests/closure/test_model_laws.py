@@ -116,28 +116,24 @@ def test_derivatives_of_the_closed_valve_agree_with_differences(tissue, names, a
 
 
 def test_a_valve_from_its_shape_about_to_open():
-    # Its leaflets are free of stress in the closed valve of 30 mmHg.
+    # Its leaflets are free of stress in the equilibrium of linear tissue under a lower pressure.
     fixed, at = {"E_f.posterior": AT[1]}, AT[:1]
-    model = model_of(CLOSING, ("E_f.anterior",), fixed=fixed, continuation=True)
+    model = model_of(GENTLE, ("E_f.anterior",), fixed=fixed, continuation=True, **SMALL)
     plain = model.fresh()
-    relaxation = Relaxation({"anterior": AT[0], "posterior": AT[1]}, 30.0)
+    relaxation = Relaxation({"anterior": AT[0], "posterior": AT[1]}, 0.3)
     model.settings = replace(model.settings, relaxation=relaxation)
     end = plain.contact_valve.motion
-    state = HeldState(30.0, end.annulus[-1], end.papillary_tips[-1])
+    state = HeldState(0.3, end.annulus[-1], end.papillary_tips[-1])
     x = plain.rests(at, [state])[-1].frames[-1]
     at_rest, before = (
         one.tuned(at)[0].solid.evaluate(x, one.tuned(at)[0].solid.initial_strain(), 0.0)
         for one in (model, plain)
     )
-    assert np.abs(before.stress).max() > 0.05
-    assert np.abs(at_rest.stress).max() < 1e-6
-    # The tissue of an estimate does not change the shape.
-    stiffer = replace(model.fresh(), settings=replace(model.settings, tissue=STIFFENING))
-    np.testing.assert_allclose(stiffer._relaxed(), model._relaxed(), atol=1e-12)
+    assert np.abs(before.stress).max() > 0.01
+    assert np.abs(at_rest.stress).max() < 1e-9
     hasty = replace(model.settings, newton=replace(EXACT, max_iterations=1, max_halvings=0))
-    assert (
-        "relaxation: the valve does not close" in replace(model.fresh(), settings=hasty)(at).reason
-    )
+    failed = replace(model.fresh(), settings=hasty)(at)
+    assert failed.reason.startswith("relaxation: the valve does not close: Newton's method")
     with pytest.raises(InputError, match="pressure_mmHg = -1, expected > 0"):
         Relaxation({}, -1)
 
