@@ -50,9 +50,7 @@ def strip(force, moment, element="hex18", fibre=(1, 0, 0)):
 
 
 def information(system, loads, x):
-    parts = sensitivity_parts(
-        system, x, loads, [Parameter("E_f.tissue", 6.23)], linear_solver()
-    )
+    parts = sensitivity_parts(system, x, loads, [Parameter("E_f.tissue", 6.23)], linear_solver())
     return information_shares(parts.reshape(1, len(WAYS), -1))[0]
 
 
@@ -117,7 +115,7 @@ def test_parts_and_mean_of_any_stress():
     np.testing.assert_allclose(thickness_mean(solid, across), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("element, layers", [("tet10", 1), ("hex18", 2)])
+@pytest.mark.parametrize(("element", "layers"), [("tet10", 1), ("hex18", 2)])
 def test_other_meshes_are_refused(element, layers):
     mesh = block(element, (2, 1, layers))
     assert not has_one_layer(mesh)
