@@ -98,7 +98,7 @@ def summary(results: Results) -> dict[str, Table]:
         records = results.records.values()
         return {one.row: one.table_of(name) for one in records if name in one.tables}
 
-    parts, known = by_anatomy(""), set(CLOSED) & set(results.table_names)
+    parts, known = by_anatomy(""), [name for name in CLOSED if name in results.table_names]
     if "variations" not in results.table_names:
         return {"": results.table(), **{name: results.table(name) for name in known}}
     distances: dict[str, dict[str, Any]] = {}
@@ -108,7 +108,7 @@ def summary(results: Results) -> dict[str, Table]:
             mine[record.row] = row["max"]
     columns = {name: Column("mm", ".2g", label=name) for name in parts}
     shown = table(distances.values(), variation=Column(), **columns)
-    closed = {name: joined(by_anatomy(name), "anatomy") for name in sorted(known)}
+    closed = {name: joined(by_anatomy(name), "anatomy") for name in known}
     return {"": joined(parts, "anatomy"), "largest_distance": shown, **closed}
 
 

@@ -15,10 +15,10 @@ below the line between the hinges of both leaflets.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from mvest.mechanics.valve_system import boundary_loading
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.triangles import areas
-from mvest.valve.measure.clinical import Numbers, clinical_measurements, plane_of_leaflets
+from mvest.valve.measure.clinical import clinical_measurements, plane_of_leaflets
 from mvest.valve.measure.coaptation import (
     coaptation_depth,
     find_gap,
@@ -45,35 +45,42 @@ from mvest.valve.measure.coaptation import (
 )
 from mvest.valve.measure.strain import triangle_strains, weighted_quantiles
 
-MITRAL: dict[str, dict[str, Any]] = tomllib.loads(
+QUANTITIES: dict[str, dict[str, Any]] = tomllib.loads(
     Path(__file__).with_name("physiology.toml").read_text(encoding="utf-8")
 )
-"""Quantity, or quantity and part -> ``low`` and ``high`` of its published range, and ``source``."""
+"""The quantities of ``physiology.toml``."""
+
+PIXEL_MM = 0.2
+
+Values: TypeAlias = dict[tuple[str, str], float | list[float]]
+"""Quantity and part of the valve -> value, or median and quantiles at 5 and 95 % of the area."""
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One quantity of a valve and its published range."""
-
-    quantity: str
-    part: str  #: leaflet, family of chordae, papillary tip, annulus or valve
-    value: float  #: a median over the area if there are quantiles
-    unit: str
-    p5: float | None = None  #: quantile by area
-    p95: float | None = None  #: quantile by area
-    low: float | None = None  #: end of the published range; None: open
-    high: float | None = None  #: end of the published range; None: open
-    source: str = ""  #: of the range, empty without one
-    mark: str = ""  #: ``inside``, ``outside``, or empty without a range
-
-    def beside(self, low: float = -np.inf, high: float = np.inf, source: str = "") -> Finding:
-        """The same with a range, open at missing ends, and the mark that follows."""
-        ends = {name: end for name, end in (("low", low), ("high", high)) if np.isfinite(end)}
-        mark = "inside" if low <= self.value <= high else "outside"
-        return replace(self, **ends, source=source, mark=mark if ends else "")
+Row: TypeAlias = dict[str, Any]
+"""One quantity beside its range: ``quantity``; ``part``, a leaflet, family of chordae, papillary
+tip or the valve; ``value``, a median if it has the quantiles ``p5`` and ``p95`` by area; ``unit``;
+``low`` and ``high`` ends of the range, None if open; ``source`` of the range; ``mark``, ``inside``,
+``outside``, or empty without a range."""
 
 
-def physiology(model: ClosureModel, system: System, x: FloatArray) -> tuple[Finding, ...]:
+def beside_ranges(values: Values, *, mitral: bool) -> list[Row]:
+    """The finite values in the order of `QUANTITIES`, of a mitral valve with its ranges."""
+    rows, order = [], list(QUANTITIES)
+    for (quantity, part), given in sorted(values.items(), key=lambda one: order.index(one[0][0])):
+        value, p5, p95 = given if isinstance(given, list) else (given, None, None)
+        about = QUANTITIES[quantity] | QUANTITIES[quantity].get(part, {})
+        low, high = (about.get(end) if mitral else None for end in ("low", "high"))
+        ranged = low is not None or high is not None
+        inside = (low is None or value >= low) and (high is None or value <= high)
+        if np.isfinite(value):
+            row = {"quantity": quantity, "part": part, "value": float(value), "p5": p5, "p95": p95}
+            row |= {"unit": about["unit"], "low": low, "high": high}
+            row["mark"] = ("inside" if inside else "outside") if ranged else ""
+            rows.append(row | {"source": about["source"] if ranged else ""})
+    return rows
+
+
+def physiology(model: ClosureModel, system: System, x: FloatArray) -> list[Row]:
     """Measure a closed valve.
 
     Quantities that its shape does not admit are left out, as those of coaptation lines are for
@@ -92,30 +99,31 @@ def physiology(model: ClosureModel, system: System, x: FloatArray) -> tuple[Find
     InputError
         If an element is turned inside out.
     """
-    valve, shape = model.valve, model.observed(x)
-    loads = closed_loads(model, system)
-    found = [
-        *_strains(valve, shape, model.contact_reach_mm),
-        *_stresses(valve, peak_stress(system, x)),
-        *_closed_shape(valve, shape, loads, model.contact_reach_mm),
-        *_chordae(chord_loads(system, x, loads)),
-        *_open_shape(valve),
-    ]
-    return _marked(valve, found)
+    valve, shape, reach = model.valve, model.observed(x), model.contact_reach_mm
+    surface, ring, loads = valve.surface, shape[valve.annulus], closed_loads(model, system)
+    plane = plane_of_leaflets(shape, surface, ring, loads.tips)
+    leaflets = [surface.triangles[surface.region == k] for k in range(len(surface.region_names))]
+    image = project_leaflets(shape, surface.triangles, ring, plane, PIXEL_MM)
+    section = image.depth[:, np.argmin(np.abs(image.lateral))]
+    section = section[np.isfinite(section)]
+    hinges = np.linspace(section[0], section[-1], len(section)) if len(section) else 0.0
+    peaks = peak_stress(system, x)
+    values = _sizes(valve, (shape, loads.tips, reach)) | _strains(valve, shape, reach)
+    for name in surface.region_names:
+        values["99 % of the principal stress", name] = peaks[f"stress_p99_{name}_mpa"]
+        values["largest stress", name] = peaks[f"stress_max_{name}_mpa"]
+    if len(leaflets) == 2:
+        depth = coaptation_depth(shape, leaflets[0], leaflets[1], plane, reach)
+        values["tenting height", "valve"] = depth
+    values["tenting area, middle section", "valve"] = PIXEL_MM * float(np.sum(section - hinges))
+    values["closed gap", "valve"] = find_gap(shape, surface.triangles, ring, plane, reach).area
+    values |= _chordae(chord_loads(system, x, loads))
+    return beside_ranges(values, mitral=len(leaflets) == 2)
 
 
-def open_physiology(valve: Valve) -> tuple[Finding, ...]:
-    """What is known of a valve that was not closed: leaflets, orifice and annulus."""
-    return _marked(valve, _open_shape(valve))
-
-
-def _marked(valve: Valve, found: Iterable[Finding]) -> tuple[Finding, ...]:
-    known = MITRAL if len(valve.surface.region_names) == 2 else {}
-    return tuple(
-        one.beside(**known.get(f"{one.quantity}, {one.part}", known.get(one.quantity, {})))
-        for one in found
-        if np.isfinite(one.value)
-    )
+def open_physiology(valve: Valve) -> list[Row]:
+    """What is known of a valve that was not closed: leaflets and orifice."""
+    return beside_ranges(_sizes(valve), mitral=len(valve.surface.region_names) == 2)
 
 
 def closed_loads(model: ClosureModel, system: System) -> Loads:
@@ -125,16 +133,12 @@ def closed_loads(model: ClosureModel, system: System) -> Loads:
 
 
 class ChordLoads(NamedTuple):
-    """What the chordae bear: ``force (c,)`` N and ``strain (c,)``, negative if slack.
+    """What the chordae bear."""
 
-    ``at_tip (t, 3)`` N is their pull on each papillary tip, ``families`` the members ``(c,)`` of
-    each.
-    """
-
-    force: FloatArray
-    strain: FloatArray
-    at_tip: FloatArray
-    families: dict[str, BoolArray]
+    force: FloatArray  #: (c,) N
+    strain: FloatArray  #: ``(c,)``, negative if slack
+    at_tip: FloatArray  #: ``(t, 3)`` N, pull on each papillary tip
+    families: Mapping[str, BoolArray]  #: family -> its members ``(c,)``
 
 
 def chord_loads(system: System, x: FloatArray, loads: Loads) -> ChordLoads:
@@ -145,11 +149,11 @@ def chord_loads(system: System, x: FloatArray, loads: Loads) -> ChordLoads:
     pull = cables.forces(x, loads.tips, *system.factors.chordae)[0]
     np.add.at(at_tip, cables.tip, pull)
     strain = cables.strain(x, loads.tips, system.factors.chord_rest_length)
-    return ChordLoads(np.linalg.norm(pull, axis=1), strain, at_tip, dict(cables.families))
+    return ChordLoads(np.linalg.norm(pull, axis=1), strain, at_tip, cables.families)
 
 
-def _strains(valve: Valve, shape: FloatArray, reach: float) -> Iterator[Finding]:
-    surface = valve.surface
+def _strains(valve: Valve, shape: FloatArray, reach: float) -> Values:
+    surface, values = valve.surface, Values()
     strain = 100.0 * triangle_strains(surface.vertices, shape, surface)
     size = areas(surface.vertices, surface.triangles)
     free = ~touching_triangles(shape, surface.triangles, reach)
@@ -157,95 +161,56 @@ def _strains(valve: Valve, shape: FloatArray, reach: float) -> Iterator[Finding]
         leaflet = surface.region == number
         belly = leaflet & free
         for k, way in enumerate(("along", "across")) if belly.any() else ():
-            low, middle, high = weighted_quantiles(strain[belly, k], size[belly], (0.05, 0.5, 0.95))
-            yield Finding(f"membrane strain {way} the fibres", name, middle, "%", low, high)
+            found = weighted_quantiles(strain[belly, k], size[belly], (0.5, 0.05, 0.95))
+            values[f"membrane strain {way} the fibres", name] = found
         for what, own in (("belly", belly), ("leaflet", leaflet)):
-            if own.any():
-                share = 100.0 * float(size[own & (strain[:, 0] < 0)].sum() / size[own].sum())
-                yield Finding(f"{what} compressed along the fibres", name, share, "% of area")
+            share = size[own] @ (strain[own, 0] < 0) / max(size[own].sum(), 1e-300)
+            values[f"area of the {what} compressed along the fibres", name] = 100.0 * float(share)
+    return values
 
 
-def _stresses(valve: Valve, peaks: dict[str, float]) -> Iterator[Finding]:
-    for name in valve.surface.region_names:
-        for kind, words in (("p99", "99 % of the principal stress"), ("max", "largest stress")):
-            yield Finding(words, name, peaks[f"stress_{kind}_{name}_mpa"], "MPa")
-
-
-def _closed_shape(valve: Valve, shape: FloatArray, loads: Loads, reach: float) -> Iterator[Finding]:
-    surface, ring = valve.surface, shape[valve.annulus]
-    plane = plane_of_leaflets(shape, surface, ring, loads.tips)
-    closed = clinical_measurements(shape, surface, ring, loads.tips, reach)
-    image = project_leaflets(shape, surface.triangles, ring, plane, 0.2)
-    middle = int(np.argmin(np.abs(image.lateral)))
-    seen = image.inside[:, middle] & np.isfinite(image.depth[:, middle])
-    if len(surface.region_names) == 2:
-        pair = [surface.triangles[surface.region == k] for k in (0, 1)]
-        height = closed.get("coaptation_length_mm", np.nan)
-        yield Finding("coaptation height, middle section", "valve", height, "mm")
-        area = closed.get("coaptation_area_mm2", np.nan)
-        yield Finding("coaptation area", "valve", area, "mm²")
-        depth = coaptation_depth(shape, pair[0], pair[1], plane, reach)
-        yield Finding("tenting height", "valve", depth, "mm")
-    depths = image.depth[seen, middle]
-    hinges = np.linspace(depths[0], depths[-1], len(depths)) if len(depths) else 0.0
-    tented = 0.2 * float((depths - hinges).sum())
-    yield Finding("tenting area, middle section", "valve", tented, "mm²")
-    volume = closed.get("tenting_volume_mm3", np.nan)
-    yield Finding("tenting volume", "valve", volume, "mm³")
-    gap = find_gap(shape, surface.triangles, ring, plane, reach).area
-    yield Finding("closed gap", "valve", gap, "mm²")
-    before = _open(valve)
-    for words, name in SIZES.items():
-        size = closed.get(name, np.nan)
-        yield Finding(f"{words}, closed", "annulus", size, "mm²" if words == "area" else "mm")
-        change = 100.0 * (size / before.get(name, np.nan) - 1.0)
-        yield Finding(f"{words}, change", "annulus", change, "%")
-    ratio = 100.0 * closed.get("annulus_height_to_width_ratio", np.nan)
-    yield Finding("height over commissural diameter, closed", "annulus", ratio, "%")
-
-
-SIZES = {
-    "anteroposterior diameter": "ap_diameter_mm",
-    "commissural diameter": "commissural_diameter_mm",
-    "height": "annulus_height_mm",
-    "area": "annulus_area_mm2",
-}
-"""Sizes of the annulus -> their clinical measurements."""
-
-
-def _chordae(chords: ChordLoads) -> Iterator[Finding]:
-    for k, pull in enumerate(chords.at_tip):
-        force = float(np.linalg.norm(pull))
-        yield Finding("force on a papillary tip", f"tip {k + 1}", force, "N")
+def _chordae(chords: ChordLoads) -> Values:
+    values: Values = {
+        ("force on a papillary tip", f"tip {k + 1}"): float(np.linalg.norm(pull))
+        for k, pull in enumerate(chords.at_tip)
+    }
     for family, own in chords.families.items():
-        if not own.any():
-            continue
         force, strain = chords.force[own], chords.strain[own]
-        yield Finding("mean chordal force", family, float(force.mean()), "N")
-        yield Finding("largest chordal force", family, float(force.max()), "N")
-        yield Finding("largest chordal strain", family, 100.0 * float(strain.max()), "%")
-        yield Finding("slack chordae", family, float((strain <= 0).sum()), f"of {own.sum()}")
+        values["chordae", family] = float(own.sum())
+        if own.any():
+            values["mean chordal force", family] = float(force.mean())
+            values["largest chordal force", family] = float(force.max())
+            values["largest chordal strain", family] = 100.0 * float(strain.max())
+            values["slack chordae", family] = float((strain <= 0).sum())
+    return values
 
 
-def _open(valve: Valve) -> Numbers:
-    surface, tips = valve.surface, valve.papillary_tips
-    return clinical_measurements(
-        surface.vertices, surface, surface.vertices[valve.annulus], tips, 0.0
-    )
-
-
-def _open_shape(valve: Valve) -> Iterator[Finding]:
-    measured, names = _open(valve), valve.surface.region_names
-    own = [measured[f"{name}_area_mm2"] for name in names if f"{name}_area_mm2" in measured]
-    for name, size in zip(names, own, strict=False):
-        yield Finding("area", name, size, "mm²")
-        length = measured.get(f"{name}_length_mm", np.nan)
-        yield Finding("length, middle section", name, length, "mm")
-    if len(own) == 2:
-        yield Finding("posterior over anterior area", "valve", own[1] / own[0], "")
-    ring = measured.get("annulus_area_3d_mm2", np.nan)
-    yield Finding("leaflet over annulus area", "valve", sum(own) / ring, "")
-    yield Finding("open orifice", "valve", measured.get("orifice_mm2", np.nan), "mm²")
+def _sizes(valve: Valve, closed: tuple[FloatArray, FloatArray, float] | None = None) -> Values:
+    """Clinical measurements of the open valve and the closed one: shape, tips and reach."""
+    surface, values = valve.surface, Values()
+    frames = {"open": (surface.vertices, valve.papillary_tips, 0.0)}
+    frames |= {} if closed is None else {"closed": closed}
+    measured = {
+        frame: defaultdict(
+            lambda: np.nan, clinical_measurements(x, surface, x[valve.annulus], tips, reach)
+        )
+        for frame, (x, tips, reach) in frames.items()
+    }
+    for quantity, about in QUANTITIES.items():
+        frame, _, name = about.get("measure", "").partition(" ")
+        for part in surface.region_names if "{part}" in name else ("valve",):
+            key = name.format(part=part)
+            if frame in measured:
+                values[quantity, part] = measured[frame][key]
+            elif frame == "change" and closed is not None:
+                change = measured["closed"][key] / measured["open"][key] - 1.0
+                values[quantity, part] = 100.0 * change
+    size = [measured["open"][f"{name}_area_mm2"] for name in surface.region_names]
+    if len(size) == 2:
+        values["posterior over anterior area", "valve"] = size[1] / size[0]
+    ring = measured["open"]["annulus_area_3d_mm2"]
+    values["leaflet over annulus area", "valve"] = sum(size) / ring
+    return values
 
 
 def modulus_parts(model: ClosureModel, m: FloatArray, x: FloatArray, loads: Loads) -> FloatArray:
@@ -268,7 +233,7 @@ def modulus_parts(model: ClosureModel, m: FloatArray, x: FloatArray, loads: Load
 
 def resistance_rows(
     model: ClosureModel, m: FloatArray, x: FloatArray, whitened: FloatArray | None = None
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """By which tissue each leaflet resists, in % of its strain energy and of the information.
 
     A share of the information on a modulus, all else known, is negative where the tissue works

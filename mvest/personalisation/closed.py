@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import numpy as np
 
 from mvest.closure.physiology import (
@@ -46,6 +44,6 @@ def closed_details(
         rows = valve.rows(errors.fitted.observation(), moves)
         whitened = errors.noise(learned).whiten(rows).reshape(len(rows), *last.shape[2:])
     return {
-        "physiology": tuple(map(asdict, physiology(model, system, closed))),
+        "physiology": tuple(physiology(model, system, closed)),
         "resistance": tuple(resistance_rows(model, at, closed, whitened)),
     }

@@ -7,8 +7,8 @@ import pytest
 
 from mvest.closure.model import ClosureModel
 from mvest.closure.physiology import (
-    MITRAL,
-    Finding,
+    QUANTITIES,
+    beside_ranges,
     chord_loads,
     closed_loads,
     modulus_parts,
@@ -48,7 +48,7 @@ def closed():
 
 @pytest.fixture(scope="module")
 def found(closed):
-    return {(one.quantity, one.part): one for one in physiology(*closed[:3])}
+    return {(row["quantity"], row["part"]): row for row in physiology(*closed[:3])}
 
 
 def test_tips_and_annulus_carry_the_pressure(closed, found):
@@ -62,7 +62,7 @@ def test_tips_and_annulus_carry_the_pressure(closed, found):
     pull = chord_loads(system, x, loads).at_tip
     np.testing.assert_allclose(pull.sum(axis=0) + ring, push, atol=1e-6)
     for k, own in enumerate(pull):
-        assert found["force on a papillary tip", f"tip {k + 1}"].value == np.linalg.norm(own)
+        assert found["force on a papillary tip", f"tip {k + 1}"]["value"] == np.linalg.norm(own)
 
 
 def test_chordae_are_counted_by_family(closed, found):
@@ -71,10 +71,12 @@ def test_chordae_are_counted_by_family(closed, found):
     chords = chord_loads(system, x, closed_loads(model, system))
     for k, family in enumerate(chordae.family_names):
         own = chordae.family == k
-        slack = found["slack chordae", family]
-        assert (slack.value, slack.unit) == ((chords.force[own] == 0).sum(), f"of {own.sum()}")
-        largest = found["largest chordal force", family].value
-        assert largest == chords.force[own].max() > found["mean chordal force", family].value > 0
+        value = {q: found[q, family]["value"] for q, part in found if part == family}
+        slack = (chords.force[own] == 0).sum()
+        assert (value["chordae"], value["slack chordae"]) == (own.sum(), slack)
+        assert value["largest chordal force"] == chords.force[own].max()
+        assert 0 < value["mean chordal force"] < value["largest chordal force"]
+        assert value["largest chordal strain"] == 100 * chords.strain[own].max()
 
 
 def test_strain_of_the_belly_excludes_what_touches(closed, found):
@@ -84,25 +86,28 @@ def test_strain_of_the_belly_excludes_what_touches(closed, found):
     for k, name in enumerate(surface.region_names):
         one = found["membrane strain along the fibres", name]
         own = strain[surface.region == k]
-        assert own.min() <= one.p5 < one.value < one.p95 <= own.max()
+        assert own.min() <= one["p5"] < one["value"] < one["p95"] <= own.max()
         belly, leaflet = (
-            found[f"{what} compressed along the fibres", name].value
+            found[f"area of the {what} compressed along the fibres", name]["value"]
             for what in ("belly", "leaflet")
         )
         assert 0 < belly < 100
         assert belly != leaflet
         # The median is a strain of tissue in tension if and only if less than half is compressed.
-        assert (one.value > 0) == (belly < 50)
+        assert (one["value"] > 0) == (belly < 50)
 
 
 def test_stress_coaptation_and_tenting_are_the_valves(closed, found):
     model, system, x, _ = closed
     peaks = peak_stress(system, x)
     for name in ("anterior", "posterior"):
-        assert found["largest stress", name].value == peaks[f"stress_max_{name}_mpa"]
-        assert found["99 % of the principal stress", name].value < peaks[f"stress_max_{name}_mpa"]
-    height = found["coaptation height, middle section", "valve"].value
-    area, tenting = (found[q, "valve"].value for q in ("coaptation area", "tenting height"))
+        largest = peaks[f"stress_max_{name}_mpa"]
+        assert found["largest stress", name]["value"] == largest
+        assert (
+            found["99 % of the principal stress", name]["value"] < peaks[f"stress_max_{name}_mpa"]
+        )
+    height = found["coaptation height, middle section", "valve"]["value"]
+    area, tenting = (found[q, "valve"]["value"] for q in ("coaptation area", "tenting height"))
     surface, shape = model.valve.surface, model.observed(x)
     touching = touching_triangles(shape, surface.triangles, model.contact_reach_mm)
     both = areas(shape, surface.triangles)[touching].sum()
@@ -113,29 +118,30 @@ def test_stress_coaptation_and_tenting_are_the_valves(closed, found):
 
 
 def test_a_mark_follows_the_range():
-    tenting = Finding("tenting height", "valve", 9.3, "mm")
-    ends = MITRAL["tenting height"]
-    assert tenting.beside(**ends).mark == "outside"
-    assert replace(tenting, value=5.0).beside(**ends).mark == "inside"
-    assert tenting.beside(high=9.0).mark == "outside"
-    assert tenting.beside(low=9.0) == replace(tenting, low=9.0, mark="inside")
-    assert tenting.beside() == tenting
-    for name, own in MITRAL.items():
-        assert set(own) <= {"low", "high", "source"}, name
-        assert own["source"], name
-        assert own.get("low", -np.inf) < own.get("high", np.inf), name
+    def mark(value, quantity="tenting height", part="valve", mitral=True):
+        (row,) = beside_ranges({(quantity, part): value}, mitral=mitral)
+        return row["mark"], row["low"], row["high"]
+
+    assert mark(9.3) == ("outside", 4.0, 6.0)
+    assert mark(3.9)[0] == "outside"
+    assert mark(5.0)[0] == mark(6.0)[0] == "inside"
+    assert mark(9.3, mitral=False) == ("", None, None)
+    assert mark(0.1, "closed gap") == ("outside", None, 0.0)
+    assert mark(-0.1, "annulus height, change") == ("outside", 0.0, None)
+    assert mark([4.0, -9.0, 30.0], "membrane strain along the fibres", "anterior")[0] == "inside"
+    # A range may be that of one leaflet.
+    assert mark(12.0, "length, middle section", "posterior")[0] == "inside"
+    assert mark(12.0, "length, middle section", "anterior")[0] == "outside"
+    assert mark(600.0, "area", "anterior") == ("", None, None)
+    assert beside_ranges({("tenting height", "valve"): np.nan}, mitral=True) == []
 
 
-def test_every_range_belongs_to_a_quantity(found):
-    known = {q for q, _ in found} | {f"{q}, {part}" for q, part in found}
-    assert set(MITRAL) <= known
-    for one in found.values():
-        outside = (one.low is not None and one.value < one.low) or (
-            one.high is not None and one.value > one.high
-        )
-        ranged = one.low is not None or one.high is not None
-        assert one.mark == ("" if not ranged else "outside" if outside else "inside")
-        assert bool(one.source) == ranged
+def test_every_quantity_is_found_and_every_range_has_a_source(found):
+    assert list(dict.fromkeys(quantity for quantity, _ in found)) == list(QUANTITIES)
+    for row in found.values():
+        low, high = row["low"], row["high"]
+        assert bool(row["source"]) == bool(row["mark"]) == ((low, high) != (None, None))
+        assert (-np.inf if low is None else low) < (np.inf if high is None else high)
 
 
 def test_a_valve_of_three_leaflets_has_what_needs_no_pair(closed, found):
@@ -158,19 +164,19 @@ def test_a_valve_of_three_leaflets_has_what_needs_no_pair(closed, found):
         tuple(f"E_f.{name}" for name in names),
     )
     system, _ = three.tuned(np.array([*AT, AT[1]]))
-    seen = {(one.quantity, one.part): one for one in physiology(three, system, x)}
-    assert {part for _, part in seen} >= {*names, "valve", "annulus", "tip 1", "tip 2"}
-    assert not any(one.mark or one.source for one in seen.values())
+    seen = {(row["quantity"], row["part"]): row for row in physiology(three, system, x)}
+    assert {part for _, part in seen} >= {*names, "valve", "tip 1", "tip 2"}
+    assert not any(row["mark"] or row["source"] for row in seen.values())
     quantities = {quantity for quantity, _ in seen}
     assert not quantities & {"tenting height", "coaptation area", "posterior over anterior area"}
     assert {"tenting volume", "closed gap"} <= quantities
     for what in ("force on a papillary tip", "largest stress", "membrane strain along the fibres"):
         same = "tip 1" if "tip" in what else "anterior"
-        assert seen[what, same].value == pytest.approx(found[what, same].value, rel=1e-6)
+        assert seen[what, same]["value"] == pytest.approx(found[what, same]["value"], rel=1e-6)
 
 
 def test_an_open_valve_has_its_sizes_only():
-    found = {one.quantity for one in open_physiology(TEMPLATE.valve(64, 17))}
+    found = {row["quantity"] for row in open_physiology(TEMPLATE.valve(64, 17))}
     assert {"area", "length, middle section", "open orifice"} <= found
     assert not any("strain" in name or "force" in name for name in found)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -178,7 +178,7 @@ def closed_tables(model: ClosureModel, result: ClosureResult, m: FloatArray) -> 
         return {}
     x = result.simulation.frames[-1]
     return {
-        "physiology": physiology_table(map(asdict, physiology(model, result.system, x))),
+        "physiology": physiology_table(physiology(model, result.system, x)),
         "resistance": resistance_table(resistance_rows(model, m, x)),
     }
 

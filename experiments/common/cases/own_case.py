@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -233,7 +233,7 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
             coarse.on_step = bar.step
             expected = expect_case(case, settings, coarse)
     if not expected.physiology:
-        expected = replace(expected, physiology=[*map(asdict, open_physiology(coarse.valve))])
+        expected = replace(expected, physiology=open_physiology(coarse.valve))
     page = check_page(folder, case.name, lines, expected, drawn[-1])
     texts = [f"{name}\n{one.text()}" for name, one in expected_tables(expected).items()]
     if not expected.unknowns:

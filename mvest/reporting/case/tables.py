@@ -66,7 +66,7 @@ def frame_table(frames: Sequence[FrameFit]) -> Table:
 
 
 def physiology_table(rows: Iterable[Row]) -> Table:
-    """Quantities of a closed valve beside their published ranges; rows as of `Finding`.
+    """Quantities of a valve beside published ranges; rows as of `mvest.closure.physiology.Row`.
 
     A quantity outside its range says so with both.
     """
