@@ -37,16 +37,13 @@ def has_one_layer(mesh: SolidMesh) -> bool:
     """Whether the thickness is one layered element, as the split needs."""
     top, layered = mesh.reference.top_face, mesh.reference.layered
     bottom = np.arange(len(top))
-    return layered and not np.isin(mesh.elements[:, top], mesh.elements[:, bottom]).any()
+    return layered and not bool(np.isin(mesh.elements[:, top], mesh.elements[:, bottom]).any())
 
 
 def thickness_mean(solid: Solid, values: FloatArray) -> FloatArray:
     """Mean ``(e, q, k)`` of values ``(e, q, k)`` through the thickness, by volume, at each point.
 
-    Raises
-    ------
-    InputError
-        If the thickness is not one layered element.
+    InputError if the thickness is not one layered element.
     """
     if not has_one_layer(solid.mesh):
         raise InputError(
@@ -77,11 +74,10 @@ def split(solid: Solid, strain: FloatArray, stress: FloatArray) -> FloatArray:
 
 
 def work_shares(system: System, x: FloatArray) -> FloatArray:
-    """Shares ``(r, 4)`` of each region in the work of its stress on its strain, see `WAYS`.
+    """Shares ``(r, 4)`` in the work of each region's stress on its strain at ``x (n, 3)`` mm.
 
-    That is twice the strain energy where the law is linear; the strain is the law's own. A share
-    can be negative: tissue that is stretched along its fibres may be under pressure there, because
-    it shrinks across them. ``x (n, 3)`` mm; errors are those of `thickness_mean`.
+    That is twice the energy of a linear law in its own strain. A share is negative where tissue
+    that is stretched along its fibres is pressed there, because it shrinks across them.
     """
     solid = system.solid
     state = solid.evaluate(x, solid.initial_strain(), 0.0)
@@ -102,22 +98,9 @@ def sensitivity_parts(
     """Parts ``(p, 4, n, 3)`` of the derivatives of an equilibrium by moduli, see `WAYS`.
 
     With the tangent A the derivative is -A⁻¹ ∂r/∂m, and ∂r/∂m is the integral of ∂S/∂m, which is
-    split. Its sum is the derivative of `mvest.mechanics.integrate`.
-
-    Parameters
-    ----------
-    system : System
-        Set to its parameters.
-    x : (n, 3) mm
-        Nodal positions in equilibrium under ``loads``.
-    parameters : sequence of Parameter
-        That change the stress only.
-    solver : LinearSolver
-
-    Raises
-    ------
-    InputError
-        As `thickness_mean`, and if the body has no such parameter.
+    split. The parts add up to the derivative of `mvest.mechanics.integrate`. ``x (n, 3)`` mm is in
+    equilibrium under the loads; the parameters must change the stress only. Errors are those of
+    `thickness_mean`, and an InputError if the body has no such parameter.
     """
     solid, still = system.solid, system.solid.initial_strain()
     pairs = system.search_contact(x)

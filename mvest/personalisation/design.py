@@ -55,8 +55,14 @@ def expect_case(
     linear = LinearModel(problem.names, prior.covariance, H, point.errors)
     after = np.sqrt(linear.variances())
     unknowns = expected_intervals(problem.names, transform, point.m, prior.std, after)
-    shares, advice = list(variance_shares(linear)), list(narrower(problem, linear))
-    return Expected(unknowns, shares, advice, **closed_details(point.valve, point.errors))
+    closed = closed_details(point.valve, point.errors)
+    return Expected(
+        unknowns,
+        list(variance_shares(linear)),
+        list(narrower(problem, linear)),
+        closed.get("physiology", ()),
+        closed.get("resistance", ()),
+    )
 
 
 SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)
