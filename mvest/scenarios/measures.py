@@ -1,18 +1,12 @@
-r"""Measures of a closing valve, step by step, and of a closed valve.
-
-With the right stretch :math:`U = \sqrt{I + 2E}` and the second Piola-Kirchhoff stress :math:`S` the
-Cauchy stress is :math:`\sigma = F S F^T / \det F = R \, (U S U / \det U) \, R^T` (Holzapfel 2000,
-Nonlinear Solid Mechanics, equation 3.65, with :math:`F = R U`), so that its principal values are
-those of :math:`U S U / \det U`. Computed from the Green-Lagrange strain rather than from F, they
-include the enhanced strain of solid-shells, which is not part of F.
-"""
+"""Measures of a closing valve, step by step, and of a closed valve."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from mvest.closure.model import ClosureModel, ClosureResult
-from mvest.errors import InputError
+from mvest.closure.physiology import chord_loads
+from mvest.closure.stress import peak_stress
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.scenarios.scenario import plane_of
@@ -75,10 +69,7 @@ def measure_steps(
         middle, outer, loads = model.observed(x), faces(x), loading(time)
         annulus = middle[valve.annulus]
         plane = plane_of(valve, annulus)
-        strain = force = 0.0
-        if (cables := system.cables) is not None:
-            state = cables.state(x, loads.tips, *system.factors.chordae)
-            strain, force = float(state.strain.max()), float(state.tension.max())
+        chords = chord_loads(system, x, loads)
         now, rest = (
             jacobian_determinants(y, mesh.elements, mesh.reference, mesh.reference.points)
             for y in (x, mesh.nodes)
@@ -94,88 +85,13 @@ def measure_steps(
                 "orifice": orifice_area(outer, closed_surface.triangles, annulus, plane),
                 "coaptation": length,
                 "intersections": len(intersecting_triangles(outer, closed_surface.triangles)),
-                "chord strain": strain,
-                "chord force": force,
+                "chord strain": float(chords.strain.max(initial=0.0)),
+                "chord force": float(chords.force.max(initial=0.0)),
                 "smallest det F": float((now / rest).min()),
                 "Newton iterations": iterations,
             }
         )
     return measures
-
-
-_PLACE = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
-"""Index of each tensor component in the six-vector 11, 22, 33, 23, 13, 12."""
-
-
-def principal_cauchy(green: FloatArray, stress: FloatArray) -> FloatArray:
-    """Largest principal Cauchy stress (MPa).
-
-    Parameters
-    ----------
-    green : ndarray
-        ``(..., 6)`` Green-Lagrange strain, engineering shear.
-    stress : ndarray
-        ``(..., 6)`` second Piola-Kirchhoff stress, MPa.
-    """
-    strain = green[..., _PLACE] * np.where(np.eye(3, dtype=bool), 1.0, 0.5)
-    squared, axes = np.linalg.eigh(np.eye(3) + 2 * strain)
-    stretch = np.sqrt(squared)
-    u = np.einsum("...ik,...k,...jk->...ij", axes, stretch, axes)
-    sigma = u @ stress[..., _PLACE] @ u / np.prod(stretch, axis=-1)[..., None, None]
-    return np.asarray(np.linalg.eigvalsh(sigma)[..., -1])
-
-
-def _stress(system: System, x: FloatArray) -> FloatArray:
-    """First principal Cauchy stress ``(e, q)`` MPa at the quadrature points."""
-    solid = system.solid
-    state = solid.evaluate(x, solid.initial_strain(), 0.0)
-    return principal_cauchy(state.green, state.stress)
-
-
-def peak_stress(system: System, x: FloatArray) -> Measured:
-    """Peak stress of each region in equilibrium, named as in `Measured`; volumes are at rest.
-
-    The largest stress occurs at a chordal insertion or at the hinge, and grows with mesh
-    refinement; the percentiles grow much less.
-
-    Parameters
-    ----------
-    system : System
-        Set to its parameters.
-    x : ndarray
-        ``(n, 3)`` mm nodal positions.
-
-    Raises
-    ------
-    InputError
-        If an element is inverted.
-    """
-    values, mesh = _stress(system, x), system.solid.mesh
-    if not np.isfinite(values).all():
-        raise InputError("the stress is not finite: an element is turned inside out")
-    peaks: Measured = {}
-    for number, name in enumerate(mesh.region_names):
-        own = values[mesh.region == number].ravel()
-        order, volumes = np.argsort(own), system.solid.volumes[mesh.region == number].ravel()
-        below = np.cumsum(volumes[order]) / volumes.sum()
-        for kind, share in (("p95", 0.95), ("p99", 0.99)):
-            peaks[f"stress_{kind}_{name}_mpa"] = float(own[order][np.searchsorted(below, share)])
-        peaks[f"stress_max_{name}_mpa"] = float(own.max())
-    return peaks
-
-
-def nodal_stress(system: System, x: FloatArray) -> FloatArray:
-    """First principal Cauchy stress ``(n,)`` (MPa) at the nodes, averaged over their elements.
-
-    Parameters are those of `peak_stress`.
-    """
-    solid = system.solid
-    weight = solid.volumes.sum(axis=1)
-    mean = (_stress(system, x) * solid.volumes).sum(axis=1) / weight
-    nodes, count = solid.mesh.elements, solid.mesh.elements.shape[1]
-    total = np.bincount(nodes.ravel(), np.repeat(weight, count), len(x))
-    stress = np.bincount(nodes.ravel(), np.repeat(mean * weight, count), len(x))
-    return np.asarray(stress / np.maximum(total, np.finfo(float).tiny), dtype=np.float64)
 
 
 def contact_pressure(system: System, x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -20,12 +20,15 @@ from experiments.common.records.record import FAILED_GATE, NOT_GATED, PASSED_GAT
 from experiments.common.schema import Values, build
 from mvest.cache import content_digest
 from mvest.closure.model import ClosureModel, ClosureResult
+from mvest.closure.physiology import physiology, resistance_rows
 from mvest.closure.robustness import GATE_CASES, GateReport, run_gate
+from mvest.closure.stress import nodal_stress
 from mvest.errors import InputError
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.reading.npz import read_npz
+from mvest.reporting.case.tables import physiology_table, resistance_table
 from mvest.reporting.tables import Table, table
-from mvest.scenarios.measures import contact_pressure, measure_steps, nodal_stress
+from mvest.scenarios.measures import contact_pressure, measure_steps
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.geometry.thickening import thicken
@@ -43,7 +46,7 @@ def gate_report(values: Values) -> GateReport:
     """Close the configured anatomy with its true moduli, under variations; prints each result."""
     return run_gate(
         lambda case: closure_model(values, case),
-        np.array(values["truth"]["values"], dtype=float),
+        truth_of(values),
         GATE_CASES,
         on_case=lambda row: say(f"{row.case}: max {row.max_mm:.3g} mm, {row.reason}"),
         on_path=lambda path: say(f"along {path.name}: {path.reason or 'no jump'}"),
@@ -172,13 +175,31 @@ class Closing:
         }
 
 
+def closed_tables(model: ClosureModel, result: ClosureResult, m: FloatArray) -> dict[str, Table]:
+    """The closed valve beside published ranges, and by which tissue it resists, at ``m (p,)``.
+
+    Nothing unless the closure ends at rest.
+    """
+    if not (result.simulation.converged and model.settings.protocol.equilibrium):
+        return {}
+    x = result.simulation.frames[-1]
+    return {
+        "physiology": physiology_table(physiology(model, result.system, x)),
+        "resistance": resistance_table(resistance_rows(model, m, x)),
+    }
+
+
+def truth_of(values: Mapping[str, Any]) -> FloatArray:
+    """The configured true values ``(p,)``."""
+    return np.array(values["truth"]["values"], dtype=float)
+
+
 def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
     """Close the configured valve with the true moduli; ``name`` is shown with the progress."""
     model = closure_model(values)
-    truth = np.array(values["truth"]["values"], dtype=float)
     with SolveBar(name, len(model.settings.protocol.steps()), 1) as bar:
         model.on_step = bar.step
-        result = model.close(truth, sensitivities=False, every_frame=True)
+        result = model.close(truth_of(values), sensitivities=False, every_frame=True)
     seen = values["observation"]
     return Closing(model, result, anatomy_of(values).normals(seen["columns"], seen["rows"]))
 

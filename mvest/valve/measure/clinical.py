@@ -118,7 +118,7 @@ def clinical_measurements(
         if the annulus has no plane.
     """
     try:
-        plane = _plane(vertices, surface, annulus, tips)
+        plane = plane_of_leaflets(vertices, surface, annulus, tips)
     except MvestError:
         return {}
     triangles, region = surface.triangles, np.asarray(surface.region)
@@ -140,15 +140,16 @@ def annulus_and_tips(
 ) -> Numbers:
     """The measurements of `clinical_measurements` that need no leaflets, a hundred times faster."""
     try:
-        plane = _plane(vertices, surface, annulus, tips)
+        plane = plane_of_leaflets(vertices, surface, annulus, tips)
     except MvestError:
         return {}
     return _tried(_annulus, annulus, plane) | _tips(tips, annulus, plane, ())
 
 
-def _plane(
+def plane_of_leaflets(
     vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, tips: FloatArray
 ) -> AnnulusPlane:
+    """Plane of an annulus ``(k, 3)`` mm; leaflets and tips ``(t, 3)`` mm tell its sides."""
     # The middle of a leaflet's own annulus is nearest to that leaflet.
     first = np.unique(surface.triangles[surface.region == 0])
     gap = np.linalg.norm(annulus[:, None] - vertices[first][None], axis=2).min(axis=1)
