@@ -394,8 +394,8 @@ def lay_out_chordae(
     Every chord starts at the nearer of the two tips in the reference frame. Rest lengths are those
     of `mvest.valve.anatomy.template.laid_out`. The closed frame has positions ``(n, 3)`` mm of the
     reference's vertices, or its own coordinates if its vertices do not correspond. The layout is
-    the template's for an intended closed frame (`assumed_closure`); for an observed one `SEEN_CLOSURE`, or
-    `SEEN_ON_BAND` if the valves are bands. InputError if there are not two tips.
+    the template's for an intended closed frame (`assumed_closure`); for an observed one
+    `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are bands. InputError if there are not two tips.
     """
     if len(open_tips) != 2 or len(closed_tips) != 2:
         raise InputError(f"{len(open_tips)} papillary tips; the layout of chordae needs two")
