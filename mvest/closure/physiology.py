@@ -17,6 +17,7 @@ from __future__ import annotations
 import tomllib
 from collections import defaultdict
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -24,6 +25,7 @@ import numpy as np
 
 from mvest.closure.model import ClosureModel
 from mvest.closure.stress import peak_stress
+from mvest.errors import InputError
 from mvest.mechanics.resistance import (
     WAYS,
     has_one_layer,
@@ -83,8 +85,8 @@ def beside_ranges(values: Values, *, mitral: bool) -> list[Row]:
 def physiology(model: ClosureModel, system: System, x: FloatArray) -> list[Row]:
     """Measure a closed valve.
 
-    Quantities that its shape does not admit are left out, as those of coaptation lines are for
-    other than two leaflets.
+    Quantities that it does not admit are left out, as those of coaptation lines are for other than
+    two leaflets.
 
     Parameters
     ----------
@@ -93,25 +95,22 @@ def physiology(model: ClosureModel, system: System, x: FloatArray) -> list[Row]:
         The model's, at the parameters for which ``x`` is in equilibrium.
     x : (n, 3) mm
         Nodal positions.
-
-    Raises
-    ------
-    InputError
-        If an element is turned inside out.
     """
     valve, shape, reach = model.valve, model.observed(x), model.contact_reach_mm
     surface, ring, loads = valve.surface, shape[valve.annulus], closed_loads(model, system)
     plane = plane_of_leaflets(shape, surface, ring, loads.tips)
     leaflets = [surface.triangles[surface.region == k] for k in range(len(surface.region_names))]
     image = project_leaflets(shape, surface.triangles, ring, plane, PIXEL_MM)
-    section = image.depth[:, np.argmin(np.abs(image.lateral))]
-    section = section[np.isfinite(section)]
+    seen = np.where(image.inside, image.depth, np.inf)[:, np.argmin(np.abs(image.lateral))]
+    section = seen[np.isfinite(seen)]
     hinges = np.linspace(section[0], section[-1], len(section)) if len(section) else 0.0
-    peaks = peak_stress(system, x)
+    peaks: dict[str, float] = {}
+    with suppress(InputError):  # an element is turned inside out
+        peaks = peak_stress(system, x)
     values = _sizes(valve, (shape, loads.tips, reach)) | _strains(valve, shape, reach)
     for name in surface.region_names:
-        values["99 % of the principal stress", name] = peaks[f"stress_p99_{name}_mpa"]
-        values["largest stress", name] = peaks[f"stress_max_{name}_mpa"]
+        values["99 % of the principal stress", name] = peaks.get(f"stress_p99_{name}_mpa", np.nan)
+        values["largest stress", name] = peaks.get(f"stress_max_{name}_mpa", np.nan)
     if len(leaflets) == 2:
         depth = coaptation_depth(shape, leaflets[0], leaflets[1], plane, reach)
         values["tenting height", "valve"] = depth

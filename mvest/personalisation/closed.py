@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvest.closure.physiology import (
-    closed_loads,
-    modulus_parts,
-    physiology,
-    resistance_rows,
-)
+from mvest.closure.physiology import closed_loads, modulus_parts, physiology, resistance_rows
 from mvest.estimation.evidence import LearnedNoise
 from mvest.mechanics.resistance import has_one_layer
 from mvest.mechanics.valve_system import held_loading
@@ -27,10 +22,8 @@ def closed_details(
     besides the samples. Nothing if a frame has no equilibrium, or the closure ends in none.
     """
     model, at, states = valve.closure()
-    if not model.settings.protocol.equilibrium:
-        return {}
-    ends = model.rests(at, states)
-    if not ends[-1].converged:
+    ends = model.rests(at, states) if model.settings.protocol.equilibrium else ()
+    if not ends or not ends[-1].converged:
         return {}
     system, _ = model.tuned(at)
     closed, *others = [end.frames[-1] for end in ends]

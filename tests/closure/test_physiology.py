@@ -20,7 +20,9 @@ from mvest.closure.stress import peak_stress
 from mvest.mechanics.resistance import WAYS
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.valve.anatomy.template import Template
+from mvest.valve.geometry.proximity import plane_section
 from mvest.valve.geometry.triangles import areas
+from mvest.valve.measure.clinical import plane_of_leaflets
 from mvest.valve.measure.coaptation import touching_triangles
 from mvest.valve.measure.strain import triangle_strains
 from mvest.valve.mesh.structured import structured_mesh
@@ -198,3 +200,27 @@ def test_shares_of_information_and_energy_add_up(closed):
     J = seen[..., 1].ravel()
     expected = [100 * J @ parts[..., 1, w].ravel() / (J @ J) for w in range(4)]
     assert [rows[3][way] for way in WAYS] == pytest.approx(expected, rel=1e-5)
+
+
+def test_tetrahedra_do_not_tell_bending_from_stretching(closed):
+    model = replace(closed[0].fresh(), mesh=structured_mesh(TEMPLATE, "tet10", 8, 1))
+    assert resistance_rows(model, AT, model.mesh.nodes) == []
+
+
+def test_the_tenting_area_is_that_below_the_line_between_the_hinges(closed, found):
+    # The nearest leaflet to the atrium along lines of sight through the cut leaflets.
+    model, system, x, _ = closed
+    surface, shape = model.valve.surface, model.observed(x)
+    tips = closed_loads(model, system).tips
+    plane = plane_of_leaflets(shape, surface, shape[model.valve.annulus], tips)
+    cut, _ = plane_section(shape, surface.triangles, plane.origin, plane.lateral)
+    ends = plane.coordinates(cut.reshape(-1, 3)).reshape(-1, 2, 3)[..., [0, 2]]
+    ends = np.take_along_axis(ends, np.argsort(ends[..., :1], axis=1), axis=1)
+    along = np.linspace(ends[..., 0].min() + 1e-6, ends[..., 0].max() - 1e-6, 2001)
+    depth = np.full(len(along), np.inf)
+    for (a, low), (b, high) in ends:
+        at = (along >= a) & (along <= b)
+        depth[at] = np.minimum(depth[at], np.interp(along[at], (a, b), (low, high)))
+    below = depth - np.interp(along, along[[0, -1]], depth[[0, -1]])
+    area = found["tenting area, middle section", "valve"]["value"]
+    assert area == pytest.approx(np.trapezoid(below, along), rel=0.03)

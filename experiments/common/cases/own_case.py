@@ -232,8 +232,11 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
         with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
             coarse.on_step = bar.step
             expected = expect_case(case, settings, coarse)
+    of = "the generic valve, closed on a coarse mesh"
     if not expected.physiology:
         expected = replace(expected, physiology=open_physiology(coarse.valve))
+        of = "the open frame, since no valve was closed"
+    lines.append(f"Published ranges stand beside {of}")
     page = check_page(folder, case.name, lines, expected, drawn[-1])
     texts = [f"{name}\n{one.text()}" for name, one in expected_tables(expected).items()]
     if not expected.unknowns:

@@ -116,7 +116,7 @@ def check_page(
         lines=lines,
         reason=expected.reason,
         picture=_embedded(picture),
-        tables={name: one.readable() for name, one in expected_tables(expected).items()},
+        tables=defaultdict(list, {k: t.readable() for k, t in expected_tables(expected).items()}),
     )
     return write_atomically(folder / CHECK, page)
 

@@ -133,6 +133,10 @@ def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, mon
         assert "E_f anterior" in text
         assert "pressure measured to ±3 mmHg" in text
         assert "all that can be measured, known exactly" in text
+        # The formula has no tissue, so nothing is known but the open frame.
+        assert "the open frame, since no valve was closed" in text
+        assert "open orifice" in text
+        assert "membrane strain" not in text
 
 
 def test_tissue_whose_stiffening_is_unknown_is_on_its_way_to_the_law_that_is_considered() -> None:

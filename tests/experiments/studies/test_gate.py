@@ -9,11 +9,13 @@ from experiments.common.building.closure import closure_model
 from experiments.common.building.gate import anatomy_digest, gate_of
 from experiments.common.places import GATE_RECORDS
 from experiments.common.records.record import NOT_GATED, Record, read_record, stamp
-from experiments.common.study import Result
+from experiments.common.study import Result, Results
 from experiments.results.published import records_of, write_records
+from experiments.studies.gate import STUDY
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GATE_CASES, MAX_LIMIT, MEAN_LIMIT, GateCase
 from mvest.closure.smoothness import JUMP_LIMIT
+from mvest.reporting.markup import number
 from mvest.reporting.tables import table
 from tests.experiments.configured import composed, plain
 from tests.places import ANATOMIES
@@ -159,3 +161,34 @@ def test_the_closure_study_measures_every_step(run):
         assert 0.5 < fields["reach_mm"] < 1.32
     names = {path.name for path in folder.iterdir()}
     assert {"closure.csv", "closure.md", "closure.png"} <= names
+    assert not names & {"closure_physiology.csv", "closure_resistance.csv"}  # not at rest
+
+
+def test_a_closed_valve_stands_beside_published_ranges(run):
+    status, record, folder, _ = run(
+        "experiment=closure", "mechanics.protocol.equilibrium=true", "mechanics.protocol.dt=0.05"
+    )
+    assert status == 0
+    rows = {(row["quantity"], row["part"]): row for row in record.table_of("physiology").rows}
+    pull = rows["force on a papillary tip", "tip 1"]
+    # At 5 mmHg the chordae bear next to nothing.
+    assert 0 <= pull["value"] < 1
+    assert pull["mark"] == f"outside: {number(pull['value'])} N, 4 to 7.2 N"
+    shares = record.table_of("resistance").rows
+    assert {row["part"] for row in shares} == {"anterior", "posterior"}
+    ways = set(record.tables["resistance"]["values"]) - {"part", "of"}
+    assert [sum(row[way] for way in ways) for row in shares] == pytest.approx([100.0] * 4)
+    page = (folder / "closure.md").read_text(encoding="utf-8")
+    assert "## physiology" in page
+    assert "outside: " in page
+
+
+def test_published_physiology_names_the_anatomy():
+    closed = {"physiology": table([{"quantity": "tenting height", "value": 5.0}])}
+    records = {}
+    for name in ("one", "two"):
+        record = record_of("template", True)
+        records[name] = record.changed(row=name, tables={**record.tables, **closed})
+    shown = STUDY.summary(Results(records))
+    assert [row["anatomy"] for row in shown["physiology"].rows] == ["one", "two"]
+    assert "resistance" not in shown

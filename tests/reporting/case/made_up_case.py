@@ -154,6 +154,17 @@ DETAILS = {
         {"frame": "open", "shape": "observed", **SHAPE},
         {"frame": "closed", "shape": "generic", **SHAPE, "tenting_volume_mm3": 1840.0},
     ),
+    "physiology": (
+        {"quantity": "membrane strain", "part": "anterior", "value": -0.9, "unit": "%", "p5": -3.6}
+        | {"p95": 1.2, "low": None, "high": None, "source": "", "mark": ""},
+        {"quantity": "tenting height", "part": "valve", "value": 9.3, "unit": "mm", "p5": None}
+        | {"p95": None, "low": 4.0, "high": 6.0, "source": "echo", "mark": "outside"},
+        {"quantity": "closed gap", "part": "valve", "value": 0.0, "unit": "mm²", "p5": None}
+        | {"p95": None, "low": None, "high": 0.0, "source": "none", "mark": "inside"},
+    ),
+    "resistance": (
+        {"part": "anterior", "of": "information on E_f", "tension": 1.2, "bending": 98.8},
+    ),
     "settings": ({"setting": "tolerance", "value": 1e-4},),
 }
 

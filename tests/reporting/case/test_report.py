@@ -165,5 +165,15 @@ def test_tables_of_a_record(case) -> None:
     assert marked == [True, False]
     # 0.5 and 0.71 over 0.8, in per cent, the most useful first.
     assert [row["E_f anterior"] for row in tables["narrower"].rows] == pytest.approx([62.5, 88.75])
+    strain, tenting, gap = tables["physiology"].readable()
+    assert strain["value (5 to 95 % of the area)"] == "-0.9 (-3.6 to 1.2)"
+    assert [row["mark"] for row in (strain, tenting, gap)] == [
+        "", "outside: 9.3 mm, 4 to 6 mm", "inside",
+    ]  # fmt: skip
+    assert [row["published range"] for row in (tenting, gap)] == ["4 to 6", "at most 0"]
+    (share,) = tables["resistance"].readable()
+    assert share == {"leaflet": "anterior", "share of": "information on E_f"} | {
+        "tension (%)": "1", "bending (%)": "99",
+    }  # fmt: skip
     *_, volume, length = tables["measurements"].rows
     assert (volume["closed, generic"], length["closed, generic"]) == (1840.0, None)
