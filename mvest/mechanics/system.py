@@ -314,10 +314,13 @@ class System:
         if parameter.kind == "pressure_scale" and self.pressure is not None:
             add_forces(out, self.pressure.faces, -loads.pressure * self.pressure.forces(x))
         elif parameter.kind in ("chord_stiffness", "chord_rest_length") and self.cables is not None:
-            which = parameter.kind.removeprefix("chord_").removeprefix("rest_")
-            own = self.factors.chordae[which == "length"]
+            cables, factors = self.cables, self.factors.chordae
+            state = cables.state(x, loads.tips, *factors)
+            own = cables.members(parameter.part) / parameter.value
             # A chord's factor is a product: its derivative by one factor is the product over that.
-            share = own * self.cables.members(parameter.part) / parameter.value
-            state = self.cables.state(x, loads.tips, *self.factors.chordae)
-            add_forces_at(out, self.cables.patches, self.cables.change(state, **{which: share}))
+            if parameter.kind == "chord_stiffness":
+                force = cables.change(state, stiffness=factors[0] * own)
+            else:
+                force = cables.change(state, length=factors[1] * own)
+            add_forces_at(out, cables.patches, force)
         return out

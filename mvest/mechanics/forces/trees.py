@@ -89,7 +89,7 @@ class Trees:
         stiffness: FloatArray,
         toe: float,
     ) -> FloatArray:
-        """Positions ``(j, 3)`` mm of the junctions; NaN where there are none.
+        """Positions ``(j, 3)`` mm of the junctions; NaN in a tree whose search does not converge.
 
         Parameters
         ----------
