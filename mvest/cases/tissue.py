@@ -272,7 +272,8 @@ def _laid_out(
         goal = coordinates(band)
     chordae = lay_out_chordae(opened, seen.tips, goal, closed.papillary_tips, layout)
     folder.derived.append(
-        f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
+        f"chordae: {len(chordae.insertion)} laid out as in the template, each to its nearer "
+        "papillary tip, "
         f"rest lengths from {how}"
     )
     return chordae
@@ -392,10 +393,10 @@ def lay_out_chordae(
     """Place the chordae of a layout on a valve with two papillary tips ``(2, 3)`` mm.
 
     Every chord starts at the nearer of the two tips in the reference frame. Rest lengths are those
-    of `mvest.valve.anatomy.template.laid_out`. The closed frame has positions ``(n, 3)`` mm of the reference's
-    vertices, or its own coordinates if its vertices do not correspond. The layout is the template's
-    for an intended closed frame (`assumed_closure`); for an observed one `SEEN_CLOSURE`, or
-    `SEEN_ON_BAND` if the valves are bands. InputError if there are not two tips.
+    of `mvest.valve.anatomy.template.laid_out`. The closed frame has positions ``(n, 3)`` mm of the
+    reference's vertices, or its own coordinates if its vertices do not correspond. The layout is
+    the template's for an intended closed frame (`assumed_closure`); for an observed one
+    `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are bands. InputError if there are not two tips.
     """
     if len(open_tips) != 2 or len(closed_tips) != 2:
         raise InputError(f"{len(open_tips)} papillary tips; the layout of chordae needs two")
