@@ -223,7 +223,7 @@ def made_up_case(
 def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
     """Let ``personalise`` build the formula instead of a closure; the models it builds.
 
-    It has no geometry and no law that could be in doubt.
+    It has no geometry and no law that could be in doubt, and no tissue.
     """
     built: list[MadeUpClosure] = []
 
@@ -238,6 +238,8 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
     monkeypatch.setattr("mvest.personalisation.estimation.build_model", build)
     monkeypatch.setattr("mvest.personalisation.design.build_model", build)
     monkeypatch.setattr("mvest.personalisation.design.build_coarse", build)
+    monkeypatch.setattr("mvest.personalisation.chain.closed_details", lambda *_: {})
+    monkeypatch.setattr("mvest.personalisation.design.closed_details", lambda *_: {})
     monkeypatch.setattr("mvest.personalisation.errors.geometry_modes", lambda *_: ())
     monkeypatch.setattr("mvest.personalisation.errors.law_and_mesh_sources", lambda *_: ())
     return built

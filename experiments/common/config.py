@@ -33,7 +33,7 @@ from experiments.common.study import load_study, study_names
 from mvest.errors import ConfigurationError
 from mvest.files import sha256_of
 from mvest.imaging.models import MODEL_FILE
-from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.settings import MechanicsSettings, Relaxation, TissueSettings
 from mvest.problem.registration import range_of
 from mvest.provenance import config_hash
 
@@ -107,8 +107,8 @@ class Truth:
     # Columns and rows of a coarser mesh: both closures are extrapolated to zero mesh size.
     extrapolated_from: tuple[q.AxisCount, ...] = ()
     dt_factor: Annotated[float, q.within(0.001, 100, "", "one time step over another")] = 1.0
-    reading: str | None = None  # Poisson option
-    ratio: dict[str, q.Ratio] = field(default_factory=dict)  # region -> E_f over E_perp
+    tissue: dict[str, TissueSettings] = field(default_factory=dict)  # empty: the estimator's
+    relaxation: Relaxation | None = None
     fixed: ByParameter = field(default_factory=dict)  # pressure_scale, chord_stiffness, ...
 
 

@@ -16,11 +16,13 @@ from experiments.common.building.closure import closure_model
 from experiments.common.building.gate import (
     anatomy_digest,
     close_valve,
+    closed_tables,
     closures_of,
     draw_closing,
     gate_of,
     gate_report,
     gate_rows,
+    truth_of,
 )
 from experiments.common.records.record import Mesh
 from experiments.common.study import Job, Result, Results, Study
@@ -53,11 +55,12 @@ def run(job: Job[Settings]) -> Result:
 def _gate(job: Job[Settings]) -> Result:
     values = job.values
     report = gate_report(values)
-    model = closure_model(values)
+    model, truth = closure_model(values), truth_of(values)
     reference, closures = report.rows[0], closures_of(report)
+    closed = closed_tables(model, model.close(truth, sensitivities=False), truth)
     verdict = {"passed": report.passed, "closures": closures}
     return Result(
-        tables={"": table([verdict], passed=""), "variations": gate_rows(report)},
+        tables={"": table([verdict], passed=""), "variations": gate_rows(report), **closed},
         # Other studies find the verdict by these.
         numbers={"anatomy": anatomy_digest(values), "passed": report.passed},
         status="converged" if reference.passed else "failed",
@@ -71,7 +74,10 @@ def _closing(job: Job[Settings]) -> Result:
     closing = close_valve(job.values)
     simulation = closing.result.simulation
     return Result(
-        tables={"": closing.steps()},
+        tables={
+            "": closing.steps(),
+            **closed_tables(closing.model, closing.result, truth_of(job.values)),
+        },
         numbers={
             "contact_distance_mm": closing.contact_distance_mm,
             "ends_at_rest": closing.model.settings.protocol.equilibrium and simulation.converged,
@@ -86,10 +92,15 @@ def _closing(job: Job[Settings]) -> Result:
 
 
 def summary(results: Results) -> dict[str, Table]:
-    """Verdicts and largest distance of each variation by anatomy, or the steps."""
-    parts = {record.row: record.table_of() for record in results.records.values()}
+    """Verdicts and largest distance of each variation by anatomy, or the steps; closed valves."""
+
+    def by_anatomy(name: str) -> dict[str, Table]:
+        records = results.records.values()
+        return {one.row: one.table_of(name) for one in records if name in one.tables}
+
+    parts, known = by_anatomy(""), [name for name in CLOSED if name in results.table_names]
     if "variations" not in results.table_names:
-        return {"": results.table()}
+        return {"": results.table(), **{name: results.table(name) for name in known}}
     distances: dict[str, dict[str, Any]] = {}
     for record in results.records.values():
         for row in record.table_of("variations").rows[1:]:
@@ -97,7 +108,12 @@ def summary(results: Results) -> dict[str, Table]:
             mine[record.row] = row["max"]
     columns = {name: Column("mm", ".2g", label=name) for name in parts}
     shown = table(distances.values(), variation=Column(), **columns)
-    return {"": joined(parts, "anatomy"), "largest_distance": shown}
+    closed = {name: joined(by_anatomy(name), "anatomy") for name in known}
+    return {"": joined(parts, "anatomy"), "largest_distance": shown, **closed}
+
+
+CLOSED = ("physiology", "resistance")
+"""Tables of a closed valve, see `closed_tables`."""
 
 
 MOMENTS = (0.75, 0.1)
@@ -127,7 +143,7 @@ def figure(results: Results) -> Figure | None:
     }
     drawn = Figure(figsize=(11, 8.4), layout="constrained")
     parts: Any = drawn.subfigures(2, 1, height_ratios=[2.2, 1.0])
-    draw_closing(parts[0], results.arrays[name], titles, ("anterior", "posterior"))
+    draw_closing(parts[0], results.arrays[name], titles)
     _draw_curves(parts[1], values, moments, at_rest)
     drawn.suptitle(
         "A simulated valve closing, from the atrium and from the posterior side"

@@ -370,7 +370,7 @@ def figure(results: Results) -> Figure | None:
         return case_figure(results.arrays[name])
     drawn = Figure(figsize=(8.0, 7.4), layout="constrained")
     titles = {0: "open, as modelled", 1: "closed (simulated)"}
-    draw_closing(drawn, results.arrays[name], titles, ("anterior", "posterior"))
+    draw_closing(drawn, results.arrays[name], titles)
     title = f"{record.title}: only its shape is real"
     drawn.suptitle(f"{title}\n{fill(str(record.numbers['data']), 110)}", fontsize=9)
     return drawn

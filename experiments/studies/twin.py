@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,9 @@ from mvest.problem.record import EstimateRecord, record_of
 from mvest.problem.registration import unit_of
 from mvest.problem.stored import Extrapolated
 from mvest.reporting.tables import Column, Table, table
+from mvest.scenarios.measures import measure_closed
+from mvest.valve.geometry.triangles import areas
+from mvest.valve.measure.strain import triangle_strains, weighted_quantiles
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,8 +36,17 @@ LOCKING = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TwinSettings:
+    """What is computed besides the estimate."""
+
+    measure_truth: bool = False  # strain, stress and tenting of the closed valve that is observed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """The study adds no settings to the configuration."""
+    """Settings that the study adds to the configuration."""
+
+    twin: TwinSettings = field(default_factory=TwinSettings)
 
 
 def run_twin(job: Job[Settings]) -> Result:
@@ -43,6 +55,7 @@ def run_twin(job: Job[Settings]) -> Result:
     twin = build_twin(values)
     if twin.model.mesh.element_type == "tet4":
         print(LOCKING, file=sys.stderr)
+    measured = _measured(twin) if job.settings.twin.measure_truth else {}
     seeds = range(values["seed"], values["seed"] + values["repeats"])
     results = estimate_twin(twin, seeds)
     result = results[0]
@@ -56,7 +69,7 @@ def run_twin(job: Job[Settings]) -> Result:
         correction = twin.source.correction(twin.truth_values)
         shift = np.linalg.lstsq(found.jacobian, correction)[0]
         band = list(100 * np.abs(shift / twin.truth_values))
-    row = _row(values, estimates[0], band) | {"forward solves": solves}
+    row = _row(values, estimates[0], band) | measured | {"forward solves": solves}
     paper = [_paper_row(values, estimates[0])] if values["paper"] else []
     return Result(
         tables={"": _table([*paper, row])},
@@ -69,6 +82,29 @@ def run_twin(job: Job[Settings]) -> Result:
         forward_solves=solves,
         gate=gate_of(values),
     )
+
+
+def _measured(twin: Twin) -> dict[str, float]:
+    """Tenting, median strains from the open valve, and stress of the closed truth, by leaflet.
+
+    Empty if it does not close.
+    """
+    model = twin.truth_model
+    model.continuation = True  # the observation is made from this closed state
+    closed = model.close(twin.truth_values, sensitivities=False)
+    if not closed.simulation.converged:
+        return {}
+    x, surface = closed.simulation.frames[-1], model.valve.surface
+    found = measure_closed(model, closed.system, x)
+    strain = triangle_strains(surface.vertices, model.observed(x), surface)
+    weight = areas(surface.vertices, surface.triangles)
+    row = {"tenting": found["tenting_height_mm"]}
+    for k, name in enumerate(surface.region_names):
+        own = surface.region == k
+        for direction, values in zip(("along", "across"), 100 * strain[own].T, strict=True):
+            row[f"strain {direction}, {name}"] = weighted_quantiles(values, weight[own], [0.5])[0]
+        row[f"stress, {name}"] = found[f"stress_p99_{name}_mpa"]
+    return row
 
 
 def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
@@ -155,7 +191,13 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
         "distance mean": Column("mm", std="distance SD", label="distance"),
         "distance SD": Column("mm"),
         **dict.fromkeys(("source", "status", "reason"), Column(hidden=True)),
+        "tenting": Column("mm"),
     }
+    for name in rows[-1]:
+        if name.startswith(("strain ", "stress, ")):
+            kind, _, leaflet = name.partition(", ")
+            label = f"99 % {kind}, {leaflet}" if kind == "stress" else f"median {name}"
+            about[name] = Column("MPa" if kind == "stress" else "%", label=label)
     return table(rows, **about)
 
 

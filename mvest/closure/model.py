@@ -18,7 +18,7 @@ from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.cables import TiedPoints
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.parameters import Parameter
-from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.settings import MechanicsSettings, Relaxation, TissueSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import Damping, Simulation, Step
 from mvest.mechanics.system import Loads, System
@@ -103,6 +103,10 @@ class ClosureModel:
     ties: TiedPoints | None = None
     #: (n, 3) mm, optional, initial displacement of the nodes of the open valve
     perturbation: FloatArray | None = None
+    #: the strain of the relaxed shape, and what it was computed with
+    relaxed: tuple[MechanicsSettings, SolidMesh, FloatArray] | None = field(
+        default=None, repr=False
+    )
 
     _closed: ClosedState | None = field(default=None, init=False, repr=False)
     _system: System | None = field(default=None, init=False, repr=False)
@@ -165,10 +169,55 @@ class ClosureModel:
         values = self._values(m)
         if self._system is None:
             self._system = build_system(
-                self.valve, self.contact_valve, self.mesh, self.settings, values, ties=self.ties
+                self.valve,
+                self.contact_valve,
+                self.mesh,
+                self.settings,
+                values,
+                ties=self.ties,
+                relaxed=self._relaxed(),
             )
         retune(self._system, self.settings, values)
         return self._system, tuple(Parameter(n, values[n]) for n in self.names)
+
+    def _relaxed(self) -> FloatArray | None:
+        """Strain ``(e, q, 6)`` of the valve of `Relaxation`; None if open leaflets have no stress.
+
+        Raises a MaterialError if that valve does not close.
+        """
+        relaxation = self.settings.relaxation
+        if relaxation is None:
+            return None
+        plain, end, known = self._linear(relaxation), self.contact_valve.motion, self.relaxed
+        if known is not None and known[0] == plain.settings and known[1] is self.mesh:
+            return known[2]
+        at = np.array(list(relaxation.E_f.values()))
+        state = HeldState(relaxation.pressure_mmHg, end.annulus[-1], end.papillary_tips[-1])
+        last = plain.rests(at, [state])[-1]
+        if not last.converged:
+            raise MaterialError(f"relaxation: the valve does not close: {failure_of(last)}")
+        solid = plain.tuned(at)[0].solid
+        green = solid.evaluate(last.frames[-1], solid.initial_strain(), 0.0).green
+        self.relaxed = plain.settings, self.mesh, green
+        return green
+
+    def _linear(self, relaxation: Relaxation) -> ClosureModel:
+        """The same valve with linear tissue that is free of stress when open."""
+        tissue = self.settings.tissue.items()
+        settings = replace(
+            self.settings,
+            relaxation=None,
+            protocol=replace(self.settings.protocol, equilibrium=True, curve=()),
+            tissue={r: TissueSettings(t.ratio, t.nu, reading=t.reading) for r, t in tissue},
+        )
+        return replace(
+            self.fresh(),
+            settings=settings,
+            names=tuple(f"E_f.{region}" for region in relaxation.E_f),
+            fixed={},
+            guide=None if self.guide is None else self.guide._linear(relaxation),
+            ties=None,
+        )
 
     @property
     def closed(self) -> ClosedState | None:

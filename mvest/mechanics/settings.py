@@ -24,6 +24,7 @@ from mvest.quantities import (
     PoissonRatio,
     Pressure,
     Ratio,
+    Share,
     Stiffening,
     Stiffness,
     Stretch,
@@ -91,18 +92,23 @@ class TissueSettings:
 
     ratio: Ratio  #: E_f over E_perp
     nu: PoissonRatio = 0.488  #: Poisson ratio of the paper
+    #: modulus along the fibres in compression over that in tension; 1: the paper's linear law
+    #: (:mod:`mvest.mechanics.law.biot`); not with the corotational law
+    compression: Share = 1.0
+    toe: Share = 0.02  #: strain of the fibres up to which they straighten, if that is below 1
     reading: str = "A"  #: ``A`` or ``C`` (see :class:`mvest.mechanics.law.moduli.PoissonReading`)
     #: ``biot``: the linear law, with all of the above. ``corotational``: its usual form on linear
     #: tetrahedra (:mod:`mvest.mechanics.law.biot`). ``exponential``
     #: (:mod:`mvest.mechanics.law.exponential`). ``stiffening``: a blend of linear and exponential.
     law: str = "biot"
-    #: coefficients of the exponential law; their common scale has no effect on a stiffening one
+    #: coefficients of the exponential law; a modulus E_f replaces their common scale
     exponential: ExponentialTissue | None = None
     #: share of the exponential law over that of the linear one in a blend
     stiffening: Stiffening = 0.0
-    #: in-plane stretch of the imaged open leaflet relative to its stress-free state
+    #: stretch of the imaged open leaflet along its fibres relative to its stress-free state
     #: (:mod:`mvest.mechanics.law.regional`); not with the corotational law
     prestretch: Stretch = 1.0
+    prestretch_ratio: Ratio = 1.0  #: stretch across the fibres over that along them
 
     def __post_init__(self) -> None:
         if self.law not in ("biot", "corotational", "exponential", "stiffening"):
@@ -113,9 +119,11 @@ class TissueSettings:
         if self.law in ("exponential", "stiffening") and self.exponential is None:
             raise InputError(f"law of a tissue = {self.law!r}: its coefficients are missing")
         require_numbers(self, "tissue", "stiffening", least=0)
-        require_numbers(self, "tissue", "prestretch")
-        if self.law == "corotational" and self.prestretch != 1.0:
-            raise InputError("prestretch of a tissue: the corotational law has none")
+        require_numbers(self, "tissue", "compression", "toe", "prestretch", "prestretch_ratio")
+        if self.law == "corotational":
+            for name in ("prestretch", "prestretch_ratio", "compression"):
+                if getattr(self, name) != 1.0:
+                    raise InputError(f"{name} of a tissue: the corotational law has none")
         known = [reading.value for reading in PoissonReading]
         if self.reading not in known:
             raise InputError(
@@ -125,7 +133,10 @@ class TissueSettings:
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of the parameters of the tissue."""
-        kinds = {"exponential": EXPONENTIAL_KINDS, "stiffening": ("E_f", "stiffening")}
+        kinds = {
+            "exponential": ("E_f", *EXPONENTIAL_KINDS),
+            "stiffening": ("E_f", "stiffening"),
+        }
         own = kinds.get(self.law, ("E_f",))
         return own if self.law == "corotational" else (*own, "prestretch")
 
@@ -138,7 +149,8 @@ class TissueSettings:
     def material(self, E_f: float) -> TransverselyIsotropic:
         """The material with Young's modulus ``E_f`` (MPa) along the fibre."""
         reading = PoissonReading(self.reading)
-        return TransverselyIsotropic.from_ratio(E_f, self.ratio, self.nu, reading)
+        linear = TransverselyIsotropic.from_ratio(E_f, self.ratio, self.nu, reading)
+        return replace(linear, compression=self.compression, toe=self.toe)
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,6 +267,23 @@ class ContactSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class Relaxation:
+    """The valve at the end of isovolumic relaxation, whose leaflets are free of stress.
+
+    From there leaflets in vivo were found to be linear (Krishnamurthy et al. 2009, J. Biomech.
+    42:1909). No frame is needed: the shape is that of the closed valve, of leaflets free of stress
+    when open, unloaded to the smallest pressure at which they still touch. It is the same for all
+    parameters of an estimate.
+    """
+
+    E_f: dict[str, Modulus]  #: region -> modulus (MPa) with which that valve closes
+    pressure_mmHg: Pressure = 10.0  #: the default template opens between 10 and 5 mmHg
+
+    def __post_init__(self) -> None:
+        require_numbers(self, "relaxation", "pressure_mmHg")
+
+
+@dataclass(frozen=True, slots=True)
 class MechanicsSettings:
     """All settings of the mechanics except valve, mesh and parameters.
 
@@ -278,6 +307,8 @@ class MechanicsSettings:
         ``field.REGION.K`` are 0.
     patches : dict
         Any name -> :class:`StiffPatch`, for simulations.
+    relaxation : Relaxation or None
+        The shape that is free of stress; None: that of the mesh.
     """
 
     tissue: dict[str, TissueSettings]
@@ -292,6 +323,7 @@ class MechanicsSettings:
     solver: str = "auto"
     fields: dict[str, ModulusField] = field(default_factory=dict)
     patches: dict[str, StiffPatch] = field(default_factory=dict)
+    relaxation: Relaxation | None = None
 
     def __post_init__(self) -> None:
         require_numbers(self, "mechanics", "density", "support_stiffness", "patch_radius")

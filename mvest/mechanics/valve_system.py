@@ -18,8 +18,15 @@ from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law import Law
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import ExponentialLaw, StiffeningLaw
-from mvest.mechanics.law.regional import FieldBasis, LeafletLaw, ModulusVariation, at_quadrature
+from mvest.mechanics.law.exponential import ExponentialLaw, StiffeningLaw, as_stiff
+from mvest.mechanics.law.regional import (
+    FieldBasis,
+    LeafletLaw,
+    ModulusVariation,
+    at_quadrature,
+    prestretch_map,
+    relaxed_map,
+)
 from mvest.mechanics.parameters import NamePart, kind_of
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, MechanicsSettings
 from mvest.mechanics.solid import Solid
@@ -56,6 +63,7 @@ def build_system(
     settings: MechanicsSettings,
     values: Mapping[str, float],
     ties: TiedPoints | None = None,
+    relaxed: FloatArray | None = None,
 ) -> System:
     """A system of the valve in the given mesh.
 
@@ -71,6 +79,8 @@ def build_system(
         Parameter (:data:`mvest.mechanics.parameters.KINDS`) -> value, at least the modulus of each
         region.
     ties : TiedPoints, optional
+    relaxed : (e, q, 6), optional
+        See `material_law`.
 
     Raises
     ------
@@ -81,7 +91,7 @@ def build_system(
     """
     check_parameters(values, valve, settings)
     chordae = valve.chordae
-    law = material_law(mesh, settings, values, variation_of(valve, mesh, settings))
+    law = material_law(mesh, settings, values, variation_of(valve, mesh, settings), relaxed)
     solid = Solid(mesh, law, density=settings.density)
     surface = contact_valve.surface
     midpoints = embed(mesh, surface.vertices)
@@ -145,6 +155,7 @@ def material_law(
     settings: MechanicsSettings,
     values: Mapping[str, float],
     variation: ModulusVariation | None = None,
+    relaxed: FloatArray | None = None,
 ) -> Law:
     """The law of the mesh.
 
@@ -157,6 +168,8 @@ def material_law(
         of other parts than tissue are ignored.
     variation : ModulusVariation, optional
         From `variation_of`; by default the moduli are constant within each leaflet.
+    relaxed : (e, q, 6), optional
+        Green-Lagrange strain of the shape that is free of stress, by default the mesh's.
 
     Raises
     ------
@@ -171,16 +184,24 @@ def material_law(
         raise InputError("the corotational law is that of all regions of a mesh, or of none")
     together = [regions] if len(kinds) == 1 and "stiffening" not in kinds else zip(regions)
     laws = tuple(_law_of(own, settings, values) for own in together)
+    tissues = [settings.tissue[region] for region in regions]
     prestretch = np.array(
-        [values.get(f"prestretch.{r}", settings.tissue[r].prestretch) for r in regions]
+        [values.get(f"prestretch.{r}", t.prestretch) for r, t in zip(regions, tissues, strict=True)]
     )
+    ratio = np.array([tissue.prestretch_ratio for tissue in tissues])
     if not np.all(prestretch > 0.0):
         raise InputError(f"prestretch of tissue = {prestretch.tolist()}, expected > 0")
-    stretched = np.any(prestretch != 1.0) or any(name.startswith("prestretch.") for name in values)
-    if variation is None and not stretched and len(laws) == 1:
+    stretched = np.any([prestretch, ratio] != np.ones(1)) or any(
+        name.startswith("prestretch.") for name in values
+    )
+    if variation is None and not stretched and relaxed is None and len(laws) == 1:
         return laws[0]
     scale = 1.0 if variation is None else variation.scale(values)
-    return LeafletLaw(laws, mesh.region, prestretch, scale, variation)
+    stress_free = prestretch_map(prestretch, ratio)[mesh.region, None]
+    if relaxed is not None:
+        own, volume = relaxed_map(relaxed)
+        stress_free, scale = stress_free @ own, scale * volume
+    return LeafletLaw(laws, mesh.region, stress_free, scale, variation, relaxed)
 
 
 def _law_of(
@@ -200,10 +221,17 @@ def _law_of(
         return {k: values[f"{k}.{region}"] for k in kinds if f"{k}.{region}" in values}
 
     if tissues[0].law == "exponential":
-        found = (given(region, *EXPONENTIAL_KINDS) for region in regions)
-        return ExponentialLaw.of(
-            [t.coefficients(own) for t, own in zip(tissues, found, strict=True)]
-        )
+        curves = []
+        for region, tissue in zip(regions, tissues, strict=True):
+            own, modulus = given(region, *EXPONENTIAL_KINDS), values.get(f"E_f.{region}")
+            if own and modulus is not None:
+                raise InputError(
+                    f"parameters E_f.{region} and {', '.join(own)} of {region!r}: expected either "
+                    "the modulus of an exponential law or its coefficients"
+                )
+            curve = tissue.coefficients(own)
+            curves.append(curve if modulus is None else as_stiff(curve, tissue, modulus))
+        return ExponentialLaw.of(curves)
     if tissues[0].law == "stiffening":
         own = {"stiffening": tissues[0].stiffening, **given(regions[0], "E_f", "stiffening")}
         return StiffeningLaw.of(tissues[0], **own)
@@ -235,8 +263,8 @@ def retune(system: System, settings: MechanicsSettings, values: Mapping[str, flo
     """Set other parameter values in a valve's system; see `build_system`."""
     assert system.cables is not None
     old = system.solid.law
-    variation = old.variation if isinstance(old, LeafletLaw) else None
-    law = material_law(system.solid.mesh, settings, values, variation)
+    kept = (old.variation, old.relaxed) if isinstance(old, LeafletLaw) else ()
+    law = material_law(system.solid.mesh, settings, values, *kept)
     system.retune(law, factors_of(system.cables, values))
 
 

@@ -14,6 +14,7 @@ from mvest.closure.model import ClosureModel
 from mvest.estimation.estimate import OnIterate
 from mvest.estimation.prediction import Prediction
 from mvest.observation.surfaces import surface_distance
+from mvest.personalisation.closed import closed_details
 from mvest.personalisation.estimation import (
     CaseEstimate,
     CaseProblem,
@@ -25,6 +26,7 @@ from mvest.personalisation.known import known_of, law_share
 from mvest.personalisation.model import held_state
 from mvest.personalisation.result import FrameComparison, Personalised
 from mvest.personalisation.settings import PersonaliseSettings, default_settings
+from mvest.personalisation.sources import ClosedValve
 from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
 
@@ -82,6 +84,11 @@ def personalise(
             law_share=law_share(estimate),
             confirmed_mm=largest_difference_anew(problem, estimate) if settings.confirm else None,
         )
+        registered, m = point.closure.registered, result.estimate
+        valve = ClosedValve(registered, m, registered(m).y)
+        learned = None if result.filtered is None else result.filtered.learned
+        closed = closed_details(valve, point.errors, learned)
+        found = replace(found, details={**found.details, **closed})
     stated = LinearisationPoint(
         problem.stated, point.errors.as_stated(), generic.m, generic.prediction
     )

@@ -22,6 +22,7 @@ from mvest.closure.frames import ERROR, OFFSET, SCALE, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.estimation.prediction import predict
 from mvest.estimation.transform import to_filter
+from mvest.personalisation.closed import closed_details
 from mvest.personalisation.estimation import CaseProblem, linearised
 from mvest.personalisation.known import LinearModel, narrower, variance_shares
 from mvest.personalisation.model import build_coarse, build_model
@@ -54,7 +55,14 @@ def expect_case(
     linear = LinearModel(problem.names, prior.covariance, H, point.errors)
     after = np.sqrt(linear.variances())
     unknowns = expected_intervals(problem.names, transform, point.m, prior.std, after)
-    return Expected(unknowns, list(variance_shares(linear)), list(narrower(problem, linear)))
+    closed = closed_details(point.valve, point.errors)
+    return Expected(
+        unknowns,
+        list(variance_shares(linear)),
+        list(narrower(problem, linear)),
+        closed.get("physiology", ()),
+        closed.get("resistance", ()),
+    )
 
 
 SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)

@@ -69,17 +69,14 @@ def build_model(
         If the leaflets cannot be meshed.
     """
     coarse = build_coarse(case, settings, store)
-    shape = GivenValve(case.valve)
-    if shape.band is None:
-        return replace(coarse, rounded_start=True)
-    solid = _solid(shape, settings.mesh, store)
+    solid = _solid(GivenValve(case.valve), settings.mesh, store)
     return replace(coarse, mesh=solid, guide=coarse, rounded_start=True)
 
 
 def build_coarse(
     case: ValveCase, settings: PersonaliseSettings, store: Path | None = None
 ) -> ClosureModel:
-    """As `build_model`, but on the guide mesh alone if there are two leaflets."""
+    """As `build_model`, but on the guide mesh alone."""
     mechanical = [
         u for u in settings.unknowns if not (u.name in REGISTRATION or is_frame_pressure(u.name))
     ]
@@ -100,8 +97,8 @@ def build_coarse(
     if case.closed is not None:
         protocol = replace(protocol, pressure_mmHg=case.closed.pressure_mmHg)
     shape, mesh = GivenValve(case.valve), settings.mesh
-    if shape.band is not None:
-        mesh = replace(mesh, source="structured", columns=mesh.guide_columns, rows=mesh.guide_rows)
+    columns, rows = mesh.guide_columns, mesh.guide_rows
+    mesh = replace(mesh, source="automatic", columns=columns, rows=rows)
     return ClosureModel(
         shape.given,
         shape.valve(mesh.contact_columns, mesh.contact_rows),
@@ -116,8 +113,11 @@ def build_coarse(
 
 
 def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
-    if mesh.source == "structured" or (mesh.source == "automatic" and shape.band is not None):
-        return shape.layers("hex18", mesh.columns, mesh.rows)
+    if mesh.source != "tetwild":
+        leaflets, columns = len(shape.band.sections), mesh.columns
+        if mesh.source == "automatic":
+            columns = leaflets * -(-columns // leaflets)
+        return shape.layers("hex18", columns, mesh.rows)
     return tetrahedral_leaflets(shape.given.surface, mesh.edge_length, "tet10", store)
 
 

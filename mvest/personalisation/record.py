@@ -22,6 +22,9 @@ shares         source, parameter, share: sources of the variance of a modulus' l
 narrower       what, parameter, std_now, std_if_known: SD of the logarithm of a modulus
 measurements   frame, shape (observed, generic or personalised), and one column for each of
                `mvest.valve.measure.clinical.clinical_measurements`
+physiology     columns of `mvest.closure.physiology.Row`: the closed valve at the estimate
+resistance     part, of, and one column (%) for each of `mvest.mechanics.resistance.WAYS`: by which
+               tissue it resists, and where the information on the moduli comes from
 image_step     with image_frames and pictures: `DetectedValve.details`
 ============== ==================================================================================
 """

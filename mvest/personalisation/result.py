@@ -23,6 +23,9 @@ class Expected:
     unknowns: Sequence[Mapping[str, Any]] = ()  #: from `mvest.problem.estimate.expected_intervals`
     shares: Sequence[Row] = ()  #: rows as in `mvest.personalisation.record`
     narrower: Sequence[Row] = ()  #: rows as in `mvest.personalisation.record`
+    #: Of the generic valve, closed on a coarse mesh, or of the open frame if nothing was closed.
+    physiology: Sequence[Row] = ()
+    resistance: Sequence[Row] = ()  #: rows as in `mvest.personalisation.record`
     reason: str = ""
 
 

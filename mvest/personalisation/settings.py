@@ -91,9 +91,9 @@ class PressureErrors:
 class CaseMesh:
     """Meshes of a case."""
 
-    #: ``structured``: layers of cells in material coordinates (two leaflets only); ``tetwild``: an
-    #: unstructured mesh of the thickened leaflets; ``automatic``: structured for two leaflets,
-    #: otherwise unstructured.
+    #: ``structured``: layers of cells in material coordinates; ``automatic``: these, with columns
+    #: rounded up to as many for each leaflet; ``tetwild``: an unstructured mesh of the thickened
+    #: leaflets.
     source: str = "automatic"
     columns: CellsAround = 40  #: cells of a structured mesh
     rows: CellsAlong = 5  #: cells of a structured mesh

@@ -24,7 +24,6 @@ from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.estimation.noise import ErrorColumns, ObservationNoise
 from mvest.estimation.prediction import Prediction, predict
-from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.reference import RestVariation
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import Simulation
@@ -183,23 +182,14 @@ def law_change(
     valve and states with the linear law.
     """
     at = np.asarray(m, dtype=np.float64)
-    values = {**model.fixed, **dict(zip(model.names, map(float, at), strict=True))}
     changes = []
     for region, linear in model.settings.tissue.items():
-        name = f"E_f.{region}"
-        if region not in tissue or name not in values:
+        if region not in tissue or f"E_f.{region}" not in {*model.names, *model.fixed}:
             continue
-        own = as_stiff(tissue[region], linear, values[name])
-        stiffening = replace(linear, law="exponential", exponential=own)
-        other = replace(
-            model.fresh(),
-            settings=replace(model.settings, tissue={**model.settings.tissue, region: stiffening}),
-            names=tuple(known for known in model.names if known != name),
-            fixed={known: value for known, value in model.fixed.items() if known != name},
-            guide=None,
-        )
-        others = at[[known != name for known in model.names]]
-        moved = other.rests(others, states, start=first[0].frames[-1])
+        own = replace(linear, law="exponential", exponential=tissue[region])
+        settings = replace(model.settings, tissue={**model.settings.tissue, region: own})
+        other = replace(model.fresh(), settings=settings, guide=None)
+        moved = other.rests(at, states, start=first[0].frames[-1])
         if not moved[-1].converged:
             return f"{region} of an exponential law: {moved[-1].reason.value}"
         changes.append(_observed(model, moved) - _observed(model, first))

@@ -1,23 +1,18 @@
-r"""Measures of a closing valve, step by step, and of a closed valve.
-
-With the right stretch :math:`U = \sqrt{I + 2E}` and the second Piola-Kirchhoff stress :math:`S` the
-Cauchy stress is :math:`\sigma = F S F^T / \det F = R \, (U S U / \det U) \, R^T` (Holzapfel 2000,
-Nonlinear Solid Mechanics, equation 3.65, with :math:`F = R U`), so that its principal values are
-those of :math:`U S U / \det U`. Computed from the Green-Lagrange strain rather than from F, they
-include the enhanced strain of solid-shells, which is not part of F.
-"""
+"""Measures of a closing valve, step by step, and of a closed valve."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from mvest.closure.model import ClosureModel, ClosureResult
-from mvest.errors import InputError
+from mvest.closure.physiology import chord_loads
+from mvest.closure.stress import peak_stress
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.scenarios.scenario import plane_of
-from mvest.typing import FloatArray
+from mvest.typing import FloatArray, IntArray
 from mvest.units import mpa_to_mmhg
+from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import intersecting_triangles
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.measure.annulus import measure_annulus
@@ -29,6 +24,11 @@ from mvest.valve.measure.coaptation import (
     orifice_area,
 )
 from mvest.valve.mesh.solid_mesh import embed, jacobian_determinants
+
+
+def _leaflets(surface: LeafletSurface) -> list[IntArray]:
+    """Triangles ``(m, 3)`` of each leaflet."""
+    return [surface.triangles[surface.region == k] for k in range(len(surface.region_names))]
 
 
 def measure_steps(
@@ -54,31 +54,30 @@ def measure_steps(
     list of dict
         For each step: ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening between the
         thick leaflets along the best annulus normal; ``coaptation`` (mm), the height at mid-valve
-        over which the leaflets are within the contact distance; ``intersections``, pairs of
-        intersecting triangles of the leaflets' faces; the largest ``chord strain`` and ``chord
-        force`` (N); ``smallest det F`` at the quadrature points; ``Newton iterations``.
+        over which two leaflets are within the contact distance (NaN for more); ``intersections``,
+        pairs of intersecting triangles of the leaflets' faces; the largest ``chord strain`` and
+        ``chord force`` (N); ``smallest det F`` at the quadrature points; ``Newton iterations``.
     """
     valve, system, simulation = model.valve, result.system, result.simulation
     surface, mesh = valve.surface, model.mesh
     closed_surface = thicken(surface, normals)
     faces = embed(mesh, closed_surface.vertices)
     loading = boundary_loading(system, valve, model.contact_valve, model.settings)
-    one, other = (surface.triangles[surface.region == k] for k in (0, 1))
+    leaflets = _leaflets(surface)
     measures = []
     for time, x in zip(simulation.times, simulation.frames, strict=True):
         middle, outer, loads = model.observed(x), faces(x), loading(time)
         annulus = middle[valve.annulus]
         plane = plane_of(valve, annulus)
-        strain = force = 0.0
-        if (cables := system.cables) is not None:
-            state = cables.state(x, loads.tips, *system.factors.chordae)
-            strain, force = float(state.strain.max()), float(state.tension.max())
+        chords = chord_loads(system, x, loads)
         now, rest = (
             jacobian_determinants(y, mesh.elements, mesh.reference, mesh.reference.points)
             for y in (x, mesh.nodes)
         )
         iterations = sum(len(r.residuals) - 1 for r in simulation.records if r.time <= time + 1e-12)
-        length = coaptation_length(middle, one, other, plane, contact_distance)
+        length = np.nan
+        if len(leaflets) == 2:
+            length = coaptation_length(middle, *leaflets, plane, contact_distance)
         measures.append(
             {
                 "time": float(time),
@@ -86,88 +85,13 @@ def measure_steps(
                 "orifice": orifice_area(outer, closed_surface.triangles, annulus, plane),
                 "coaptation": length,
                 "intersections": len(intersecting_triangles(outer, closed_surface.triangles)),
-                "chord strain": strain,
-                "chord force": force,
+                "chord strain": float(chords.strain.max(initial=0.0)),
+                "chord force": float(chords.force.max(initial=0.0)),
                 "smallest det F": float((now / rest).min()),
                 "Newton iterations": iterations,
             }
         )
     return measures
-
-
-_PLACE = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
-"""Index of each tensor component in the six-vector 11, 22, 33, 23, 13, 12."""
-
-
-def principal_cauchy(green: FloatArray, stress: FloatArray) -> FloatArray:
-    """Largest principal Cauchy stress (MPa).
-
-    Parameters
-    ----------
-    green : ndarray
-        ``(..., 6)`` Green-Lagrange strain, engineering shear.
-    stress : ndarray
-        ``(..., 6)`` second Piola-Kirchhoff stress, MPa.
-    """
-    strain = green[..., _PLACE] * np.where(np.eye(3, dtype=bool), 1.0, 0.5)
-    squared, axes = np.linalg.eigh(np.eye(3) + 2 * strain)
-    stretch = np.sqrt(squared)
-    u = np.einsum("...ik,...k,...jk->...ij", axes, stretch, axes)
-    sigma = u @ stress[..., _PLACE] @ u / np.prod(stretch, axis=-1)[..., None, None]
-    return np.asarray(np.linalg.eigvalsh(sigma)[..., -1])
-
-
-def _stress(system: System, x: FloatArray) -> FloatArray:
-    """First principal Cauchy stress ``(e, q)`` MPa at the quadrature points."""
-    solid = system.solid
-    state = solid.evaluate(x, solid.initial_strain(), 0.0)
-    return principal_cauchy(state.green, state.stress)
-
-
-def peak_stress(system: System, x: FloatArray) -> Measured:
-    """Peak stress of each region in equilibrium, named as in `Measured`; volumes are at rest.
-
-    The largest stress occurs at a chordal insertion or at the hinge, and grows with mesh
-    refinement; the percentiles grow much less.
-
-    Parameters
-    ----------
-    system : System
-        Set to its parameters.
-    x : ndarray
-        ``(n, 3)`` mm nodal positions.
-
-    Raises
-    ------
-    InputError
-        If an element is inverted.
-    """
-    values, mesh = _stress(system, x), system.solid.mesh
-    if not np.isfinite(values).all():
-        raise InputError("the stress is not finite: an element is turned inside out")
-    peaks: Measured = {}
-    for number, name in enumerate(mesh.region_names):
-        own = values[mesh.region == number].ravel()
-        order, volumes = np.argsort(own), system.solid.volumes[mesh.region == number].ravel()
-        below = np.cumsum(volumes[order]) / volumes.sum()
-        for kind, share in (("p95", 0.95), ("p99", 0.99)):
-            peaks[f"stress_{kind}_{name}_mpa"] = float(own[order][np.searchsorted(below, share)])
-        peaks[f"stress_max_{name}_mpa"] = float(own.max())
-    return peaks
-
-
-def nodal_stress(system: System, x: FloatArray) -> FloatArray:
-    """First principal Cauchy stress ``(n,)`` (MPa) at the nodes, averaged over their elements.
-
-    Parameters are those of `peak_stress`.
-    """
-    solid = system.solid
-    weight = solid.volumes.sum(axis=1)
-    mean = (_stress(system, x) * solid.volumes).sum(axis=1) / weight
-    nodes, count = solid.mesh.elements, solid.mesh.elements.shape[1]
-    total = np.bincount(nodes.ravel(), np.repeat(weight, count), len(x))
-    stress = np.bincount(nodes.ravel(), np.repeat(mean * weight, count), len(x))
-    return np.asarray(stress / np.maximum(total, np.finfo(float).tiny), dtype=np.float64)
 
 
 def contact_pressure(system: System, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -188,11 +112,11 @@ Measured = dict[str, float]
 
 * ``gap_mm2``: regurgitant gap, the area within the annulus where lines of sight along its normal
   stay farther than half the contact reach from every leaflet's midsurface;
-  * ``coaptation_length_mm``: length over which the leaflets touch (midsurfaces within the contact
-  reach) in the middle anteroposterior section, the smaller of the two leaflets' values;
-  * ``coaptation_area_mm2``: area over which the leaflets touch, mean of the two leaflets;
-* ``coaptation_height_mm``: that area over the commissural diameter, the mean height of the touching
-  zone across the valve;
+* ``coaptation_area_mm2``: area over which the leaflets touch (midsurfaces within the contact
+  reach), half the sum over all leaflets;
+* of two leaflets also ``coaptation_length_mm``: length over which they touch in the middle
+  anteroposterior section, the smaller of their values; and ``coaptation_height_mm``: the area over
+  the commissural diameter, the mean height of the touching zone across the valve;
 * ``tenting_height_mm``: largest depth of the leaflets below the annulus plane in the middle
   anteroposterior section;
 * ``tenting_volume_mm3``: volume between annulus plane and leaflets;
@@ -208,7 +132,7 @@ leaflet under pressure."""
 
 
 def measure_closed(model: ClosureModel, system: System, x: FloatArray) -> Measured:
-    """Measure one closed two-leaflet valve.
+    """Measure one closed valve.
 
     ``system`` is the model's, at the parameters for which ``x (n, 3)`` mm is in equilibrium.
     """
@@ -216,15 +140,16 @@ def measure_closed(model: ClosureModel, system: System, x: FloatArray) -> Measur
     vertices = model.observed(x)
     annulus = vertices[valve.annulus]
     plane, reach = plane_of(valve, annulus), model.contact_reach_mm
-    pair = surface.triangles[surface.region == 0], surface.triangles[surface.region == 1]
+    leaflets, size = _leaflets(surface), measure_annulus(annulus, plane)
+    area = coaptation_area(vertices, leaflets, reach)
     measures = {
-        "gap_mm2": find_gap(vertices, np.concatenate(pair), annulus, plane, reach).area,
-        "coaptation_length_mm": coaptation_length(vertices, *pair, plane, reach),
-        "coaptation_area_mm2": coaptation_area(vertices, *pair, reach),
+        "gap_mm2": find_gap(vertices, np.concatenate(leaflets), annulus, plane, reach).area,
+        "coaptation_area_mm2": area,
     }
+    if len(leaflets) == 2:
+        measures["coaptation_length_mm"] = coaptation_length(vertices, *leaflets, plane, reach)
+        measures["coaptation_height_mm"] = area / size.commissural_diameter
     measures |= tenting(vertices, surface.triangles, annulus, plane)
-    size = measure_annulus(annulus, plane)
-    measures["coaptation_height_mm"] = measures["coaptation_area_mm2"] / size.commissural_diameter
     measures["ap_diameter_mm"] = size.anteroposterior_diameter
     measures["annulus_circumference_mm"] = size.circumference
     return measures | peak_stress(system, x)

@@ -160,6 +160,8 @@ def clip_points(valve: Valve, clip: Clip) -> tuple[FloatArray, FloatArray]:
         is.
     """
     surface = valve.surface
+    if len(surface.region_names) != 2:
+        raise GeometryError(f"clip: {len(surface.region_names)} leaflets, expected 2")
     plane = plane_of(valve, surface.vertices[valve.annulus])
     count = max(2, int(np.ceil(clip.width_mm / SPACING_MM)) + 1)
     sides: tuple[list[FloatArray], list[FloatArray]] = ([], [])

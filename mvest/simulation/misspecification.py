@@ -17,10 +17,9 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
-from mvest.mechanics.law.exponential import as_stiff
-from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
+from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.observation.errors import CorrelatedNoise, ObservationError, SpatialCorrelation
-from mvest.quantities import Factor, Length, Share, Stretch
+from mvest.quantities import Factor, Length, Share
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import smoothstep
@@ -52,10 +51,8 @@ class Misspecification:
     missing: Share = 0.0  #: share of the closed leaflets not seen: a patch, filled in smoothly
     outliers: Share = 0.0  #: share of the vertices of the closed leaflets that are outliers
     outlier_mm: Length = 4.0  #: SD of each coordinate of their errors
-    #: Region -> tissue of the exponential law that replaces the linear one, its stresses scaled to
-    #: that one's (see `mechanics`); empty: the linear law.
-    exponential: Mapping[str, ExponentialTissue] = field(default_factory=dict)
-    prestretch: Stretch = 1.0  #: length of open leaflets in their plane over that free of stress
+    #: Region -> tissue that replaces the stated one: of another law, or prestretched. Empty: none.
+    tissue: dict[str, TissueSettings] = field(default_factory=dict)
     #: Relative error of one leaflet's length from the annulus in the open frame, too long. The
     #: leaflet is drawn at random.
     leaflet_scale: Share = 0.0
@@ -89,28 +86,14 @@ class Misspecification:
             {f"leaflets.{name}.thickness": mm for name, mm in thickness.items()}
         )
 
-    def mechanics(
-        self, mechanics: MechanicsSettings, values: Mapping[str, float]
-    ) -> MechanicsSettings:
-        """True mechanics of a valve of moduli ``E_f.REGION``, MPa.
-
-        All stresses of an exponential tissue are scaled by one factor: at the stretches of closed
-        leaflets, the mean of those along and across its fibres is the linear tissue's. InputError
-        if a region has no exponential tissue.
-        """
-        tissue = dict(mechanics.tissue)
-        if self.prestretch != 1.0:
-            tissue = {r: replace(own, prestretch=self.prestretch) for r, own in tissue.items()}
-        if self.exponential:
-            if set(self.exponential) != set(tissue):
-                raise InputError(
-                    f"exponential tissue of {', '.join(self.exponential)}, expected of "
-                    f"{', '.join(tissue)}"
-                )
-            for r, linear in tissue.items():
-                stiff = as_stiff(self.exponential[r], linear, values[f"E_f.{r}"])
-                tissue[r] = replace(linear, law="exponential", exponential=stiff)
-        return mechanics if tissue == mechanics.tissue else replace(mechanics, tissue=tissue)
+    def mechanics(self, mechanics: MechanicsSettings) -> MechanicsSettings:
+        """True mechanics; InputError if a leaflet has no other tissue while others have."""
+        if self.tissue and set(self.tissue) != set(mechanics.tissue):
+            raise InputError(
+                f"other tissue of {', '.join(self.tissue)}, expected of "
+                f"{', '.join(mechanics.tissue)}"
+            )
+        return replace(mechanics, tissue=self.tissue) if self.tissue else mechanics
 
     def noise(self, std: float, points: FloatArray, length: float) -> ObservationError:
         """Smooth errors of standard deviation ``std`` mm, of the stated correlation length (mm).

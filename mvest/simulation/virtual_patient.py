@@ -225,7 +225,7 @@ def simulate_patient(
     values = misspecification.values(values, other)
     seen = template.valve(simulation.seen_columns, simulation.seen_rows)
     real = Template(misspecification.anatomy(template.parameters, other))
-    drawn = DrawnValve(name, real, values, misspecification.mechanics(mechanics, values))
+    drawn = DrawnValve(name, real, values, misspecification.mechanics(mechanics))
     there = drawn.sampled(simulation.seen_columns, simulation.seen_rows)
     shapes = close_patient(drawn, there, simulation)
     centre = seen.motion.annulus[-1].mean(axis=0)
@@ -269,9 +269,6 @@ def close_patient(
 def _model(drawn: DrawnValve, seen: Valve, simulation: PatientSimulation) -> ClosureModel:
     """The model that closes a virtual patient, guided by coarser meshes."""
     not_modelled = {*REGISTRATION, *filter(is_frame_pressure, drawn.values)}
-    if simulation.misspecification.exponential:
-        # Its coefficients are scaled to the modulus, which is no parameter of this law.
-        not_modelled |= {name for name in drawn.values if name.startswith("E_f.")}
     protocol = drawn.mechanics.protocol
     finer = replace(protocol, dt=protocol.dt * simulation.dt_factor)
     contact = drawn.sampled(simulation.contact_columns, simulation.contact_rows)

@@ -4,6 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.template import Template
+
+STRAIGHT = Template(TemplateParameters().changed({"chordae.branches": 1})).chordae()
+"""The template's chordae without branches."""
 LOW, HIGH = 0.4, 0.6
 """Where the chordae branch, over the length from tip to leaflet."""
 SLACK = 1.1
@@ -53,5 +58,5 @@ def branching(straight, tips):
 
 
 def branched(valve):
-    """A valve with branching chordae instead of its own."""
-    return replace(valve, chordae=branching(valve.chordae, valve.papillary_tips))
+    """The template's valve with trees of two levels instead of its chordae."""
+    return replace(valve, chordae=branching(STRAIGHT, valve.papillary_tips))

@@ -13,10 +13,12 @@ from mvest.mechanics.law import Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.regional import LeafletLaw
-from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue
-from mvest.mechanics.valve_system import material_law
+from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, Relaxation
+from mvest.mechanics.valve_system import HeldState, material_law
 from tests.closure.test_model import (
+    AT,
     CLOSING,
+    EXACT,
     GENTLE,
     MODULI,
     OPEN,
@@ -39,6 +41,7 @@ EXPONENTIAL = anterior("exponential", 0.2, 4.3, 1400.0)
 STIFFENING = anterior("stiffening", 0.06, 4.3, 900.0)
 COEFFICIENTS = dict(zip(EXPONENTIAL_KINDS, (0.2, 4.3, 1400.0, 0.05, 5.0), strict=True))
 STIFF_NAMES, STIFF_AT = (*MODULI, "stiffening.anterior"), np.array([6.23, 2.09, 0.5])
+FIBRES = {name: replace(own, compression=0.05) for name, own in TISSUE.items()}
 STRETCH_NAMES, STRETCH_AT = (*MODULI, "prestretch.anterior"), np.array([6.23, 2.09, 1.03])
 
 
@@ -103,12 +106,36 @@ def test_derivatives_of_a_moving_valve_agree_with_differences_for_stiffening():
         (EXPONENTIAL, ("c0.anterior", "c2.anterior", "E_f.posterior"), (0.2, 1400.0, 4.0), {}),
         (STIFFENING, STIFF_NAMES, STIFF_AT, {"least": 0.05}),
         (TISSUE, STRETCH_NAMES, STRETCH_AT, {"step": 1.6e-3}),
+        (FIBRES, MODULI, (6.23, 2.09), {"step": 1.6e-3}),
     ],
-    ids=["exponential", "stiffening", "prestretch"],
+    ids=["exponential", "stiffening", "prestretch", "tension only"],
 )
 def test_derivatives_of_the_closed_valve_agree_with_differences(tissue, names, at, options):
     model = with_tissue(tissue, CLOSING, names, continuation=True)
     check_closed_derivatives(model, np.array(at), **options)
+
+
+def test_a_valve_from_its_shape_about_to_open():
+    # Its leaflets are free of stress in the equilibrium of linear tissue under a lower pressure.
+    fixed, at = {"E_f.posterior": AT[1]}, AT[:1]
+    model = model_of(GENTLE, ("E_f.anterior",), fixed=fixed, continuation=True, **SMALL)
+    plain = model.fresh()
+    relaxation = Relaxation({"anterior": AT[0], "posterior": AT[1]}, 0.3)
+    model.settings = replace(model.settings, relaxation=relaxation)
+    end = plain.contact_valve.motion
+    state = HeldState(0.3, end.annulus[-1], end.papillary_tips[-1])
+    x = plain.rests(at, [state])[-1].frames[-1]
+    at_rest, before = (
+        one.tuned(at)[0].solid.evaluate(x, one.tuned(at)[0].solid.initial_strain(), 0.0)
+        for one in (model, plain)
+    )
+    assert np.abs(before.stress).max() > 0.01
+    assert np.abs(at_rest.stress).max() < 1e-9
+    hasty = replace(model.settings, newton=replace(EXACT, max_iterations=1, max_halvings=0))
+    failed = replace(model.fresh(), settings=hasty)(at)
+    assert failed.reason.startswith("relaxation: the valve does not close: Newton's method")
+    with pytest.raises(InputError, match="pressure_mmHg = -1, expected > 0"):
+        Relaxation({}, -1)
 
 
 def test_a_moving_valve_has_no_derivative_by_its_prestretch():
@@ -145,7 +172,9 @@ def test_parameters_go_before_settings_and_one_law_for_all_is_not_divided():
     np.testing.assert_array_equal(both.coefficients[:, 0], [0.2, 0.3])
     longer = {**TISSUE, "anterior": replace(TISSUE["anterior"], prestretch=1.1)}
     stretched = law_of(longer, prestretch__posterior=0.98, **moduli)
-    np.testing.assert_array_equal(stretched.prestretch, [1.1, 0.98])
+    along = [stretched.stress_free[MESH.region == k, 0, 0, 0] for k in (0, 1)]
+    for found, expected in zip(along, (1.1, 0.98), strict=True):
+        np.testing.assert_allclose(found, expected**2)
     with pytest.raises(InputError, match="expected > 0"):
         law_of(longer, prestretch__posterior=-1.0, **moduli)
     twice = {**STIFFENING, "posterior": replace(STIFFENING["anterior"], stiffening=2.0)}
@@ -157,7 +186,8 @@ def test_parameters_go_before_settings_and_one_law_for_all_is_not_divided():
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (("E_f.anterior",), r"'anterior' follows the exponential law, which has c0, c1, c2"),
+        (("stiffening.anterior",), r"'anterior' follows the exponential law, which has E_f, c0"),
+        (("E_f.anterior", "c0.anterior", "E_f.posterior"), r"either the modulus .* or its coeff"),
         (("E_f.posterior", "c0.posterior"), r"'posterior' follows the biot law, which has E_f"),
     ],
 )

@@ -6,16 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mvest.closure.stress import nodal_stress, peak_stress, principal_cauchy
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import System
-from mvest.scenarios.measures import (
-    contact_pressure,
-    nodal_stress,
-    peak_stress,
-    principal_cauchy,
-)
+from mvest.scenarios.measures import contact_pressure
 from tests.mechanics.bodies import block
 from tests.mechanics.forces.test_contact import pair
 

@@ -7,8 +7,6 @@ import pytest
 
 from mvest.cases.case import Role
 from mvest.errors import InputError
-from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import CLOSED_STRETCHES, ExponentialLaw, biaxial_stress
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings, TissueSettings
 from mvest.simulation import virtual_patient
 from mvest.simulation.misspecification import Misspecification
@@ -33,7 +31,7 @@ def test_nothing_is_otherwise_by_default():
     assert misspecification.values({"pressure_scale": 1.1}, drawn) == {"pressure_scale": 1.1}
     assert misspecification.anatomy(Template().parameters, drawn) == Template().parameters
     settings = MechanicsSettings(LINEAR)
-    assert misspecification.mechanics(settings, {}) is settings
+    assert misspecification.mechanics(settings) is settings
     np.testing.assert_array_equal(misspecification.seen(POINTS, VALVE.surface, drawn), POINTS)
     assert not misspecification.open_moves(VALVE, drawn).any()
     # Nothing was drawn, so the same seed is the same valve in every misspecification.
@@ -157,26 +155,12 @@ def test_the_open_frame_is_too_large():
     np.testing.assert_array_equal(open_ring, case.surface.vertices[VALVE.annulus])
 
 
-def test_exponential_tissue_is_as_stiff_as_its_modulus_where_leaflets_are_closed():
+def test_other_tissue_replaces_that_of_every_leaflet():
     settings = MechanicsSettings(LINEAR)
-    misspecification = Misspecification(exponential=TISSUE)
-    values = {"E_f.anterior": 8.0, "E_f.posterior": 2.0}
-    own = misspecification.mechanics(settings, values)
-    at = np.array([CLOSED_STRETCHES])
-    for region, linear in LINEAR.items():
-        tissue = own.tissue[region].exponential
-        assert (tissue.c1, tissue.c2) == (4.3, 1400.0)
-        law = BiotLaw.of([linear.material(values[f"E_f.{region}"])])
-        expected = biaxial_stress(law, at).mean()
-        assert biaxial_stress(ExponentialLaw.of([tissue]), at).mean() == pytest.approx(expected)
-        # It is another law: not as stiff where it is stretched less.
-        less = 1 + 0.3 * (at - 1)
-        softer = biaxial_stress(ExponentialLaw.of([tissue]), less).mean()
-        assert softer < 0.97 * biaxial_stress(law, less).mean()
-    with pytest.raises(InputError, match="exponential tissue of anterior, expected of"):
-        replace(misspecification, exponential={"anterior": TISSUE["anterior"]}).mechanics(
-            settings, values
-        )
+    other = {name: replace(own, prestretch=1.05) for name, own in LINEAR.items()}
+    assert Misspecification(tissue=other).mechanics(settings).tissue == other
+    with pytest.raises(InputError, match="other tissue of anterior, expected of anterior, post"):
+        Misspecification(tissue={"anterior": other["anterior"]}).mechanics(settings)
 
 
 def test_settings_out_of_range_are_refused():

@@ -19,7 +19,7 @@ from mvest.quantities import Share
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
-from mvest.valve.anatomy.valve import Motion, Valve
+from mvest.valve.anatomy.valve import MaterialSurface, Motion, Valve
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
 
@@ -133,19 +133,23 @@ def upright(valve: Valve) -> Valve:
     )
 
 
+def _shape(anatomy: Anatomy) -> MaterialSurface:
+    """The anatomy in material coordinates."""
+    return anatomy if isinstance(anatomy, Template) else anatomy.band
+
+
 def guide_of(model: ClosureModel, anatomy: Anatomy, mesh: Values) -> ClosureModel | None:
     """The model on a mesh of half as many cells each way, with its own guide; None at the coarsest.
 
-    Guides have solid-shells, whatever the element and source of the model's mesh. A valve without
-    two leaflets has none.
+    Guides have solid-shells, whatever the element and source of the model's mesh.
     """
-    shape = anatomy if isinstance(anatomy, Template) else anatomy.band
-    if mesh["columns"] <= COARSEST[0] or shape is None:
+    if mesh["columns"] <= COARSEST[0]:
         return None
     cells = COARSEST
     if mesh["columns"] > 2.5 * COARSEST[0]:
-        cells = (2 * round(mesh["columns"] / 4), max(mesh["rows"] // 2, COARSEST[1]))
-    coarse = replace(model, mesh=structured_mesh(shape, "hex18", *cells), guide=None)
+        half = _varied(mesh, 0.5, len(_shape(anatomy).sections))
+        cells = (half["columns"], max(mesh["rows"] // 2, COARSEST[1]))
+    coarse = replace(model, mesh=structured_mesh(_shape(anatomy), "hex18", *cells), guide=None)
     coarse.guide = guide_of(coarse, anatomy, {"columns": cells[0], "rows": cells[1]})
     return coarse
 
@@ -178,10 +182,11 @@ def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureMod
     """
     anatomy, settings = anatomy_of(config), mechanics_of(config)
     observed, points = config["observation"], config["mechanics"]["contact_points"]
-    mesh = dict(config["mesh"]) | _varied(config["mesh"], variation.mesh)
+    leaflets = len(_shape(anatomy).sections)
+    mesh = dict(config["mesh"]) | _varied(config["mesh"], variation.mesh, leaflets)
     model = ClosureModel(
         anatomy.valve(observed["columns"], observed["rows"]),
-        anatomy.valve(**_varied(points, variation.sampling)),
+        anatomy.valve(**_varied(points, variation.sampling, leaflets)),
         build_mesh(anatomy, mesh, config["mechanics"]["element"], mesh_store(config)),
         settings,
         tuple(config["parameters"]),
@@ -198,12 +203,12 @@ def mechanics_of(config: Values) -> MechanicsSettings:
     return build(MechanicsSettings, config["mechanics"])
 
 
-def _varied(grid: Values, factor: float) -> dict[str, int]:
-    """Columns (an even number) and rows multiplied by a factor."""
+def _varied(grid: Values, factor: float, leaflets: int) -> dict[str, int]:
+    """Columns (a multiple of the leaflets) and rows multiplied by a factor."""
     columns, rows = grid["columns"], grid["rows"]
     if factor == 1.0:
         return {"columns": columns, "rows": rows}
-    return {"columns": 2 * round(0.5 * columns * factor), "rows": round(rows * factor)}
+    return {"columns": leaflets * round(columns * factor / leaflets), "rows": round(rows * factor)}
 
 
 def mesh_store(config: Values) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -20,12 +20,15 @@ from experiments.common.records.record import FAILED_GATE, NOT_GATED, PASSED_GAT
 from experiments.common.schema import Values, build
 from mvest.cache import content_digest
 from mvest.closure.model import ClosureModel, ClosureResult
+from mvest.closure.physiology import physiology, resistance_rows
 from mvest.closure.robustness import GATE_CASES, GateReport, run_gate
+from mvest.closure.stress import nodal_stress
 from mvest.errors import InputError
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.reading.npz import read_npz
+from mvest.reporting.case.tables import physiology_table, resistance_table
 from mvest.reporting.tables import Table, table
-from mvest.scenarios.measures import contact_pressure, measure_steps, nodal_stress
+from mvest.scenarios.measures import contact_pressure, measure_steps
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.geometry.thickening import thicken
@@ -43,7 +46,7 @@ def gate_report(values: Values) -> GateReport:
     """Close the configured anatomy with its true moduli, under variations; prints each result."""
     return run_gate(
         lambda case: closure_model(values, case),
-        np.array(values["truth"]["values"], dtype=float),
+        truth_of(values),
         GATE_CASES,
         on_case=lambda row: say(f"{row.case}: max {row.max_mm:.3g} mm, {row.reason}"),
         on_path=lambda path: say(f"along {path.name}: {path.reason or 'no jump'}"),
@@ -160,6 +163,7 @@ class Closing:
             "times": simulation.times,
             "triangles": surface.triangles.astype(np.int32),
             "region": surface.region.astype(np.int8),
+            "leaflets": np.array(valve.surface.region_names),
             # Along the atrial faces.
             "annulus": valve.annulus + len(valve.surface.vertices),
             "chord_tip": system.cables.tip,
@@ -171,23 +175,40 @@ class Closing:
         }
 
 
+def closed_tables(model: ClosureModel, result: ClosureResult, m: FloatArray) -> dict[str, Table]:
+    """The closed valve beside published ranges, and by which tissue it resists, at ``m (p,)``.
+
+    Nothing unless the closure ends at rest.
+    """
+    if not (result.simulation.converged and model.settings.protocol.equilibrium):
+        return {}
+    x = result.simulation.frames[-1]
+    return {
+        "physiology": physiology_table(physiology(model, result.system, x)),
+        "resistance": resistance_table(resistance_rows(model, m, x)),
+    }
+
+
+def truth_of(values: Mapping[str, Any]) -> FloatArray:
+    """The configured true values ``(p,)``."""
+    return np.array(values["truth"]["values"], dtype=float)
+
+
 def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
     """Close the configured valve with the true moduli; ``name`` is shown with the progress."""
     model = closure_model(values)
-    truth = np.array(values["truth"]["values"], dtype=float)
     with SolveBar(name, len(model.settings.protocol.steps()), 1) as bar:
         model.on_step = bar.step
-        result = model.close(truth, sensitivities=False, every_frame=True)
+        result = model.close(truth_of(values), sensitivities=False, every_frame=True)
     seen = values["observation"]
     return Closing(model, result, anatomy_of(values).normals(seen["columns"], seen["rows"]))
 
 
-def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequence[str]) -> None:
+def draw_closing(part: Any, path: Path, steps: Mapping[int, str]) -> None:
     """Draw some steps of a closure from the atrium and from the posterior side.
 
     ``part`` is a figure or part of one, ``path`` an ``.npz`` file with `Closing.arrays`. ``steps``
-    maps numbers of steps to titles; the open orifice of the last one is painted. ``names`` are
-    those of the leaflets.
+    maps numbers of steps to titles; the open orifice of the last one is painted.
 
     Raises an `InputError` if the file cannot be read.
     """
@@ -197,7 +218,7 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
 
     try:
         arrays = read_npz(path)
-        count = len(arrays["chord_tip"])
+        count, names = len(arrays["chord_tip"]), arrays["leaflets"].tolist()
         # The ends of the chordae are points of no triangle, with the junctions last.
         shapes = np.concatenate([arrays["frames"], arrays["chord_end"]], axis=1).astype(float)
         own = {
@@ -210,7 +231,7 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path}: no arrays of a closing valve ({error})") from error
     posterior = View("seen from the posterior side", 8.0, -90.0)
-    panels = part.subplots(2, len(steps), height_ratios=[1.0, 1.35])
+    panels = part.subplots(2, len(steps), height_ratios=[1.0, 1.35], squeeze=False)
     colours, last = drawing.leaflet_colours(valve.region), len(shapes) - 1
     for column, (k, title) in zip(panels.T, steps.items(), strict=True):
         for view, axes in zip((ATRIUM, posterior), column, strict=True):

@@ -21,13 +21,13 @@ from experiments.common.building.closure import (
 )
 from experiments.common.building.filters import build_filter, observation_variance, require_one_each
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.schema import Values
+from experiments.common.schema import Values, validated
 from mvest.cache import content_digest
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.parameters import kind_of
-from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.settings import MechanicsSettings, Relaxation, TissueSettings
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.valve_system import check_parameters, material_law
 from mvest.observation.errors import (
@@ -94,17 +94,19 @@ def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSett
             kind_of(name)
         except InputError as error:
             raise ConfigurationError(f"truth.fixed: {error}") from error
-    tissue = dict(settings.tissue)
-    for region, ratio in truth["ratio"].items():
-        if region not in tissue:
-            raise ConfigurationError(
-                f"truth.ratio has the region {region!r}; known: {', '.join(tissue)}"
-            )
-        tissue[region] = replace(tissue[region], ratio=ratio)
-    if truth["reading"] is not None:
-        tissue = {r: replace(old, reading=truth["reading"]) for r, old in tissue.items()}
+    tissue = validated(dict[str, TissueSettings], truth["tissue"], "truth.tissue")
+    if not set(tissue) <= set(settings.tissue):
+        raise ConfigurationError(
+            f"truth.tissue of {', '.join(tissue)}, expected of {', '.join(settings.tissue)}"
+        )
     protocol = replace(settings.protocol, dt=settings.protocol.dt * truth["dt_factor"])
-    return replace(settings, tissue=tissue, protocol=protocol)
+    relaxation = validated(Relaxation | None, truth["relaxation"], "truth.relaxation")
+    return replace(
+        settings,
+        tissue={**settings.tissue, **tissue},
+        protocol=protocol,
+        relaxation=relaxation or settings.relaxation,
+    )
 
 
 def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,6 +23,7 @@ from mvest.cases.from_images.detected import (
 )
 from mvest.cases.plausibility import implausible_values
 from mvest.cases.schema import files_of_case
+from mvest.closure.physiology import open_physiology
 from mvest.errors import ConfigurationError
 from mvest.exchange.volumes import files_of_volume
 from mvest.imaging.detection.detect import NoValveError
@@ -231,11 +232,13 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
         with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
             coarse.on_step = bar.step
             expected = expect_case(case, settings, coarse)
+    if not expected.physiology:
+        expected = replace(expected, physiology=open_physiology(coarse.valve))
     page = check_page(folder, case.name, lines, expected, drawn[-1])
-    tables = expected_tables(expected) if expected.unknowns else {}
-    texts = [f"{name}\n{one.text()}" for name, one in tables.items()]
-    lacking = [f"how well moduli could be estimated is not known: {expected.reason}"]
-    return "\n".join([case.name, *lines, *(texts or lacking), f"drawn and written: {page}"])
+    texts = [f"{name}\n{one.text()}" for name, one in expected_tables(expected).items()]
+    if not expected.unknowns:
+        texts.insert(0, f"how well moduli could be estimated is not known: {expected.reason}")
+    return "\n".join([case.name, *lines, *texts, f"drawn and written: {page}"])
 
 
 def _described(case: ValveCase) -> list[str]:

@@ -36,7 +36,7 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 
 
-def cable_force(strain: FloatArray, toe: float) -> tuple[FloatArray, FloatArray]:
+def cable_force(strain: FloatArray, toe: FloatArray | float) -> tuple[FloatArray, FloatArray]:
     """Force over EA and its derivative by the strain, both ``(c,)``."""
     e = np.clip(strain, 0.0, toe)
     force = e**3 / toe**2 - e**4 / (2 * toe**3) + np.maximum(strain - toe, 0.0)

@@ -25,6 +25,25 @@ adds ``beta d(epsilon)/dt`` to epsilon; with backward Euler
 ``T = C : (epsilon + rate (epsilon - epsilon_n))`` where ``rate = beta / dt``. Rigid rotation is
 not affected.
 
+Fibres that bear tension only. With ``compression`` k < 1
+(:class:`mvest.mechanics.law.moduli.TransverselyIsotropic`) the modulus along the fibres is k E_f in
+compression, and E_f in tension beyond a toe. Then
+
+.. math::
+    W &= \tfrac12 \epsilon : C_m : \epsilon + (1 - k) E_f \, w(\lambda - 1), \qquad
+    C_m = C - (1 - k) E_f \, e_1 \otimes e_1, \\
+    S &= L^T (C_m : \epsilon) + (1 - k) E_f \, (w' / \lambda) \, e_1, \\
+    D &= L^T C_m L + (C_m : \epsilon) : d^2\epsilon / dE^2
+         + (1 - k) E_f \left(w'' / \lambda^2 - w' / \lambda^3\right) e_1 \otimes e_1
+
+with the stretch of the fibres :math:`\lambda = \sqrt{1 + 2 E_{11}}` and the force w' of a cable
+(:mod:`mvest.mechanics.forces.cables`): zero in compression, linear beyond the toe, W three times
+continuously differentiable. Since :math:`(C^{-1})_{11} = 1 / E_f`, the Sherman-Morrison formula
+gives :math:`(C_m^{-1})_{11} = 1 / (k E_f)`, and :math:`\det C_m = k \det C`: positive definite for
+every k > 0, so small strains are stable. w is convex and does not decrease, so that the term of the
+fibres is polyconvex; the quadratic one is not, as in the linear law. All stress is proportional to
+E_f. Damping is that of the matrix C_m.
+
 In the usual corotational tetrahedron, as in the paper's simulation, the force of an element is that
 of linear elasticity in a frame that rotates with the element,
 
@@ -42,6 +61,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.law import Points
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
@@ -66,13 +86,18 @@ class BiotLaw:
     #: whether strain and stress are the linear ones in the rotated frame of the element
     #: (:class:`mvest.mechanics.solid.EdgeRotations`)
     corotational: bool = False
+    #: (2, n_regions) modulus (MPa) that fibres have in tension only, and toe strain; None if none
+    fibres: FloatArray | None = None
 
     @classmethod
     def of(
         cls, materials: Sequence[TransverselyIsotropic], *, corotational: bool = False
     ) -> BiotLaw:
         """The law with one material per region."""
-        return cls(np.ascontiguousarray([m.stiffness for m in materials]), corotational)
+        fibres = np.array([(m.tension_only, m.toe) for m in materials]).T
+        matrix = np.array([m.stiffness for m in materials])
+        matrix[:, 0, 0] -= fibres[0]
+        return cls(matrix, corotational, fibres if fibres[0].any() else None)
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -86,7 +111,15 @@ class BiotLaw:
     def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
         """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa."""
         if not self.corotational:
-            return _response(at.green, at.region, self.stiffness, at.previous, at.rate)
+            stress, tangent = _response(at.green, at.region, self.stiffness, at.previous, at.rate)
+            if self.fibres is not None:
+                modulus, toe = self.fibres[:, at.region, None]
+                # As in the kernel, a floor for strains that a Newton iteration may visit.
+                stretch = np.sqrt(np.maximum(1 + 2 * at.green[..., 0], 1e-6))
+                force, slope = cable_force(stretch - 1, toe)
+                stress[..., 0] += modulus * force / stretch
+                tangent[..., 0, 0] += modulus * (slope - force / stretch) / stretch**2
+            return stress, tangent
         stiffness = self.stiffness[at.region]
         strain = (1 + at.rate) * at.green - at.rate * at.previous
         tangent = np.repeat((1 + at.rate) * stiffness[:, None], at.green.shape[1], axis=1)

@@ -15,7 +15,9 @@ deformation :math:`\bar I_1 = J^{-2/3} \mathrm{tr}\, C` and :math:`C = I + 2E`,
 where :math:`a = \bar I_1 - 3`, a prime is a derivative by E, and f stands for :math:`E_{11}`, the
 only component on which :math:`\lambda = \sqrt{1 + 2 E_{11}}` depends in the fibre frame.
 
-The exponential is that of May-Newman and Yin (1998, J. Biomech. Eng. 120:38) for mitral leaflets.
+The exponential is that of May-Newman and Yin (1998, J. Biomech. Eng. 120:38) for mitral leaflets,
+with :math:`(c_0, c_1, c_2)` of (0.0399 kPa, 4.325, 1446.5) for the anterior and (0.0414 kPa, 4.848,
+305.4) for the posterior leaflet (recalled from there).
 Prot, Skallerud and Holzapfel (2007, Int. J. Numer. Meth. Engng 71:987) have :math:`(I_4 - 1)^2` in
 place of :math:`(\lambda - 1)^4`. Three additions:
 
@@ -25,6 +27,10 @@ place of :math:`(\lambda - 1)^4`. Three additions:
 * A penalty kappa on the volume change instead of incompressibility. It acts on J and the
   exponential on the isochoric :math:`\bar I_1`, so that there is no stress at rest. The fibre term
   is not split, since fibres feel their full stretch.
+
+What bears compression: the fibre term is zero, and the matrix remains, mu and the isotropic part of
+Q, since :math:`\bar I_1 \ge 3` grows in every isochoric deformation. So collagen that the isotropic
+part stands for bears compression, too. In a blend so does the share 1 - w of the linear law.
 
 Every term is polyconvex. Beyond Q = ``MAX_EXPONENT`` the exponential continues as a parabola, so
 that distant Newton iterates do not overflow; no tissue gets there.
@@ -89,7 +95,7 @@ class ExponentialLaw:
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of its parameters (see :mod:`mvest.mechanics.parameters`)."""
-        return EXPONENTIAL_KINDS
+        return ("E_f", *EXPONENTIAL_KINDS)
 
     def strain(self, green: FloatArray) -> FloatArray:
         """The damped strain ``(e, q, 6)``: the Green-Lagrange strain itself."""
@@ -113,6 +119,8 @@ class ExponentialLaw:
     ) -> FloatArray:
         """Derivative of S ``(e, q, 6)`` by a coefficient; InputError if there is no such one."""
         parameter.require(self.kinds)
+        if parameter.kind == "E_f":  # a factor on everything, damping included (`as_stiff`)
+            return np.where((at.region == which)[:, None, None], stress, 0.0) / parameter.value
         kind = EXPONENTIAL_KINDS.index(parameter.kind)
         return _partial_stress(at.green, at.region, self.coefficients, kind, which)
 
@@ -286,7 +294,9 @@ CLOSED_STRETCHES = (1.0, 1.11)
 def as_stiff(tissue: ExponentialTissue, linear: TissueSettings, E_f: float) -> ExponentialTissue:
     """The tissue with stresses scaled to those of a linear one of modulus ``E_f`` MPa.
 
-    At `CLOSED_STRETCHES` both have the same mean of the stresses along and across the fibres.
+    At `CLOSED_STRETCHES` of the open leaflet both have the same mean of the stresses along and
+    across the fibres: the exponential one with the prestretch of ``linear``, the linear one
+    without.
     """
     factor = E_f * _scale(tissue, linear)
     exponents = {"c1", "c2"}
@@ -305,7 +315,10 @@ def _scale(tissue: ExponentialTissue, linear: TissueSettings) -> float:
     """Factor on the stresses of the tissue for a modulus of 1 MPa."""
     stretches = np.array([CLOSED_STRETCHES])
     wanted = biaxial_stress(BiotLaw.of([linear.material(1.0)]), stretches).mean()
-    return float(wanted / biaxial_stress(ExponentialLaw.of([tissue]), stretches).mean())
+    before = linear.prestretch * np.array([1.0, linear.prestretch_ratio])
+    # Forces per area of the open leaflet, whose volume is the same.
+    stress = before * biaxial_stress(ExponentialLaw.of([tissue]), before * stretches)
+    return float(wanted / stress.mean())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -329,7 +342,10 @@ class StiffeningLaw:
         """
         if not (np.isfinite(stiffening) and stiffening >= 0.0):
             raise InputError(f"tissue stiffening = {stiffening}, expected >= 0")
-        curve = as_stiff(tissue.coefficients({}), tissue, E_f)
+        # A prestretch acts on both laws alike.
+        curve = as_stiff(
+            tissue.coefficients({}), replace(tissue, prestretch=1.0, prestretch_ratio=1.0), E_f
+        )
         linear = BiotLaw.of([tissue.material(E_f)])
         return cls(linear, ExponentialLaw.of([curve]), float(stiffening))
 

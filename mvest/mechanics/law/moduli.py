@@ -35,13 +35,19 @@ class TransverselyIsotropic:
     nu_fp, nu_pp : float
         Poisson ratios: contraction across the fibre under tension along it, and within the plane
         across the fibre.
+    compression : float
+        Modulus along the fibre in compression over that in tension; 1 is the linear law. Below 1
+        fibres carry tension only, and the rest is that of the matrix
+        (:mod:`mvest.mechanics.law.biot`).
+    toe : float
+        Strain of the fibre at which it has its full modulus, if ``compression`` is below 1.
 
     Raises
     ------
     MaterialError
-        The elastic energy is not positive definite (Jones 1975, Mechanics of Composite Materials,
-        section 2.4), which needs positive moduli, ``|nu_pp| < 1`` and
-        ``1 - nu_pp - 2 nu_fp^2 E_p / E_f > 0``.
+        ``compression`` is not in (0, 1], ``toe`` is not positive, or the elastic energy is not
+        positive definite (Jones 1975, Mechanics of Composite Materials, section 2.4), which needs
+        positive moduli, ``|nu_pp| < 1`` and ``1 - nu_pp - 2 nu_fp^2 E_p / E_f > 0``.
     """
 
     E_f: float
@@ -49,12 +55,19 @@ class TransverselyIsotropic:
     G: float
     nu_fp: float
     nu_pp: float
+    compression: float = 1.0
+    toe: float = 0.02
 
     def __post_init__(self) -> None:
         for name in ("E_f", "E_p", "G"):
             value = float(getattr(self, name))
             if not np.isfinite(value) or value <= 0:
                 raise MaterialError(f"{name} = {value} MPa, expected > 0")
+        if not (0 < self.compression <= 1 and 0 < self.toe < np.inf):
+            raise MaterialError(
+                f"compression = {self.compression} and toe = {self.toe} of the fibres, expected "
+                "a share in (0, 1] and a strain > 0"
+            )
         if not abs(self.nu_pp) < 1:
             raise MaterialError(f"nu_pp = {self.nu_pp}, expected -1 < nu_pp < 1")
         margin = 1 - self.nu_pp - 2 * self.nu_fp**2 * self.E_p / self.E_f
@@ -101,3 +114,8 @@ class TransverselyIsotropic:
         """``(6, 6)`` stiffness C in MPa, the inverse of the compliance, symmetrised."""
         c = np.linalg.inv(self.compliance)
         return 0.5 * (c + c.T)
+
+    @property
+    def tension_only(self) -> float:
+        """The part of ``E_f`` (MPa) that the fibres have in tension only."""
+        return (1 - self.compression) * self.E_f

@@ -19,14 +19,18 @@ A :class:`StiffPatch` is not estimated; it simulates a valve with stiffer tissue
 
 Prestretch: the leaflets of an imaged open valve are under load and were grown under tension; free
 of stress they would be smaller. If a leaflet of the same volume appears :math:`\lambda` times as
-long in both directions of its plane, its deformation in the fibre frame is
+long along its fibres and :math:`\rho \lambda` times as long across them, its deformation in the
+fibre frame is
 
 .. math::
-    F_0 = F\,G, \qquad G = \mathrm{diag}(\lambda, \lambda, \lambda^{-2}),
+    F_0 = F\,G, \qquad G = \mathrm{diag}(\lambda, \rho \lambda, 1 / (\rho \lambda^2)),
 
-where F deforms the imaged shape. With :math:`E_0 = \frac12 (G^T (I + 2E)\, G - I)` the stress is
-:math:`S = G\, S_0(E_0)\, G^T`, since the volume is the same. The imaged shape itself is then not in
-equilibrium. Prot and Skallerud (2017, Int. J. Numer. Meth. Biomed. Engng 33:e2806) found leaflets
+where F deforms the imaged shape. If the shape that is free of stress is known point by point, as
+that of a valve about to open at the end of isovolumic relaxation, its right stretch U relative to
+the imaged shape gives :math:`G = U^{-1} \mathrm{diag}(\ldots)`; the fibres of the law turn with the
+leaflet. With :math:`E_0 = \frac12 (G^T (I + 2E)\, G - I)` and :math:`J = \det U` the stress is
+:math:`S = J\, G\, S_0(E_0)\, G^T`. The imaged shape itself is then not in equilibrium.
+Prot and Skallerud (2017, Int. J. Numer. Meth. Biomed. Engng 33:e2806) found leaflets
 in the heart to be prestrained, and a model with prestrain to be closer to echocardiography.
 """
 
@@ -132,8 +136,36 @@ class ModulusVariation:
 
 
 POWERS = np.array([2.0, 2.0, -4.0, -1.0, -1.0, 2.0])
-"""Powers of the prestretch that multiply the components of C and S of the imaged shape."""
+"""Powers of the prestretch in the components of C of the shape that is free of stress."""
 NORMAL = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+ROWS, COLUMNS = np.array([0, 1, 2, 1, 0, 0]), np.array([0, 1, 2, 2, 2, 1])
+"""Tensor entry of each component of a six-vector."""
+
+
+def stress_free_map(G: FloatArray) -> FloatArray:
+    """Matrices ``(..., 6, 6)`` from C to ``G^T C G`` in engineering shear, for symmetric G."""
+    i, j, a, b = ROWS[:, None], COLUMNS[:, None], ROWS, COLUMNS
+    both = G[..., i, a] * G[..., j, b] + G[..., i, b] * G[..., j, a]
+    return np.asarray(both * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None])
+
+
+def prestretch_map(along: FloatArray, ratio: FloatArray) -> FloatArray:
+    """The matrices ``(..., 6, 6)`` of prestretches along the fibres; ratio: across over along."""
+    stretch = np.stack([along, along * ratio, 1 / (along**2 * ratio)], axis=-1)
+    return stress_free_map(stretch[..., None] * np.eye(3))
+
+
+def relaxed_map(green: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The matrices of a shape of Green-Lagrange strain ``(e, q, 6)``, and its det U ``(e, q)``."""
+    C = np.empty((*green.shape[:2], 3, 3))
+    C[..., ROWS, COLUMNS] = C[..., COLUMNS, ROWS] = NORMAL + (1 + NORMAL) * green
+    squared, axes = np.linalg.eigh(C)
+    G = (axes / np.sqrt(squared)[..., None, :]) @ np.swapaxes(axes, -1, -2)
+    return stress_free_map(G), np.sqrt(squared.prod(axis=-1))
+
+
+def _times(matrices: FloatArray, values: FloatArray) -> FloatArray:
+    return np.asarray((matrices @ values[..., None])[..., 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,9 +174,12 @@ class LeafletLaw:
 
     laws: tuple[Law, ...]  #: one law of all regions, or one law of a single region for each
     region: IntArray  #: ``(e,)`` of the elements
-    prestretch: FloatArray  #: ``(r,)`` of each region
-    scale: FloatArray | float = 1.0  #: factor ``(e, q)`` on the stiffness from ``variation``
+    #: ``(e, 1 or q, 6, 6)``, from C to that of the shape that is free of stress (`prestretch_map`,
+    #: `relaxed_map`)
+    stress_free: FloatArray
+    scale: FloatArray | float = 1.0  #: factor ``(e, q)`` on the stress: of ``variation``, and det U
     variation: ModulusVariation | None = None
+    relaxed: FloatArray | None = None  #: ``(e, q, 6)`` strain of the shape that is free of stress
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -161,7 +196,7 @@ class LeafletLaw:
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
         """Change of the strain measures of the laws."""
-        whole, d_whole = self._whole(green), self._stretch * d_green
+        whole, d_whole = self._whole(green), _times(self.stress_free, d_green)
         out = np.empty_like(green)
         for law, own, *_ in self._parts():
             out[own] = law.strain_change(whole[own], d_whole[own])
@@ -170,9 +205,10 @@ class LeafletLaw:
     def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
         """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)`` MPa."""
         stress, tangent = self._of_laws(at)
-        stretch, scale = self._stretch, np.asarray(self.scale)[..., None]
-        both = stretch[..., None] * stretch[..., None, :]
-        return stretch * stress * scale, both * tangent * scale[..., None]
+        scale, turned = np.asarray(self.scale)[..., None], np.swapaxes(self.stress_free, -1, -2)
+        return _times(turned, stress) * scale, turned @ tangent @ self.stress_free * scale[
+            ..., None
+        ]
 
     def partial_stress(
         self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
@@ -186,7 +222,7 @@ class LeafletLaw:
         """
         if parameter.kind == "field":
             return stress * self._mode(parameter)[..., None]
-        stretch, scale = self._stretch, np.asarray(self.scale)[..., None]
+        scale, turned = np.asarray(self.scale)[..., None], np.swapaxes(self.stress_free, -1, -2)
         if parameter.kind == "prestretch":
             if at.rate:
                 raise InputError(
@@ -194,33 +230,29 @@ class LeafletLaw:
                     "equilibrium only"
                 )
             given, tangent = self._of_laws(at)
-            by = np.where(self.region == which, 1.0 / self.prestretch[self.region], 0.0)
-            slope = POWERS * by[:, None, None] * stretch
-            by_strain = np.einsum("eqij,eqj->eqi", tangent, slope * (at.green + 0.5 * NORMAL))
-            return np.asarray(scale * (slope * given + stretch * by_strain))
-        out, given = np.zeros_like(stress), stress / scale / stretch
+            by = np.where(self.region == which, 1.0 / parameter.value, 0.0)[:, None, None] * POWERS
+            change = by * given + _times(tangent, by * (self._whole(at.green) + 0.5 * NORMAL))
+            return np.asarray(scale * _times(turned, change))
+        given = np.linalg.solve(turned, (stress / scale)[..., None])[..., 0]
+        out = np.zeros_like(stress)
         for law, own, region, first in self._parts():
             if first == which or len(self.laws) == 1:
                 points, number = self._points(at, own, region), which - first
                 out[own] = law.partial_stress(parameter, points, which=number, stress=given[own])
-        return np.asarray(scale * (stretch * out))
+        return np.asarray(scale * _times(turned, out))
 
     def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
         """Change of the stress ``(e, q, 6)`` for a change of the previous strain measures."""
         out = np.empty_like(d_previous)
         for law, own, region, _ in self._parts():
             out[own] = law.history_stress(self._points(at, own, region), d_previous[own])
-        return np.asarray(np.asarray(self.scale)[..., None] * (self._stretch * out))
-
-    @property
-    def _stretch(self) -> FloatArray:
-        """Factor ``(e, 1, 6)`` of the prestretch on the components of C and S."""
-        return np.asarray(self.prestretch[self.region, None, None] ** POWERS)
+        turned = np.swapaxes(self.stress_free, -1, -2)
+        return np.asarray(np.asarray(self.scale)[..., None] * _times(turned, out))
 
     def _whole(self, green: FloatArray) -> FloatArray:
         """Green-Lagrange strain ``(e, q, 6)`` relative to the stress-free shape."""
-        stretch = self._stretch
-        return np.asarray(stretch * green + 0.5 * (stretch - 1.0) * NORMAL)
+        at_rest = 0.5 * (_times(self.stress_free, NORMAL) - NORMAL)
+        return _times(self.stress_free, green) + at_rest
 
     def _parts(self) -> Iterator[tuple[Law, slice | IntArray, IntArray, int]]:
         """Each law, its elements, their regions in its numbering, and its first region."""

@@ -11,7 +11,7 @@ from mvest.problem.record import EstimateRecord, FrameFit, Row, Unknown
 from mvest.problem.registration import label_of
 from mvest.problem.verdict import NONE
 from mvest.reporting.expectation import expected_table
-from mvest.reporting.markup import ended
+from mvest.reporting.markup import ended, number
 from mvest.reporting.tables import Column, Table, table
 
 HIDDEN = Column(hidden=True)
@@ -65,6 +65,43 @@ def frame_table(frames: Sequence[FrameFit]) -> Table:
     return table(rows, frame="", seen="::shown to the filter", **columns)
 
 
+def physiology_table(rows: Iterable[Row]) -> Table:
+    """Quantities of a valve beside published ranges; rows as of `mvest.closure.physiology.Row`.
+
+    A quantity outside its range says so with both.
+    """
+
+    def shown(row: Row) -> Row:
+        low, high, unit = row["low"], row["high"], row["unit"]
+        ends = [number(end) for end in (low, high) if end is not None]
+        words = "at most " if low is None else "at least " if high is None else ""
+        published = words + " to ".join(ends) if ends else ""
+        marked = row["mark"]
+        if marked == "outside":
+            marked += f": {number(row['value'])} {unit}".rstrip() + f", {published} {unit}".rstrip()
+        return {**row, "published": published, "mark": marked}
+
+    return table(
+        map(shown, rows),
+        quantity="",
+        part="",
+        value=Column(low="p5", high="p95", label="value (5 to 95 % of the area)"),
+        unit="",
+        published="::published range",
+        mark="",
+        source="",
+        low=HIDDEN,
+        high=HIDDEN,
+    )
+
+
+def resistance_table(rows: Iterable[Row]) -> Table:
+    """By which tissue the leaflets resist; rows of `mvest.closure.physiology.resistance_rows`."""
+    given = list(rows)
+    ways = [name for name in (given[0] if given else {}) if name not in ("part", "of")]
+    return table(given, part="::leaflet", of="::share of", **dict.fromkeys(ways, "%:.0f"))
+
+
 def report_tables(record: EstimateRecord) -> dict[str, Table]:
     """What a report of the estimate lists, by name; a name without rows is missing."""
     rows = record.detail_rows
@@ -107,6 +144,8 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
             prior_stds=":.1f:from its prior [SD]",
         ),
         "shares": _shares(rows("shares")),
+        "physiology": physiology_table(rows("physiology")),
+        "resistance": resistance_table(rows("resistance")),
         "image_frames": _chosen(rows("image_frames")),
         "settings": table(rows("settings")),
     }
@@ -114,12 +153,15 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
 
 
 def expected_tables(expected: Expected) -> dict[str, Table]:
-    """What an estimate could tell, by name: ``unknowns``, ``shares`` and ``narrower``."""
-    return {
+    """What an estimate could tell, and what the valve is like; names without rows are missing."""
+    tables = {
         "unknowns": expected_table(expected.unknowns),
         "shares": _shares(expected.shares),
         "narrower": _narrower(expected.narrower),
+        "physiology": physiology_table(expected.physiology),
+        "resistance": resistance_table(expected.resistance),
     }
+    return {name: one for name, one in tables.items() if len(one)}
 
 
 def estimate_text(record: EstimateRecord) -> str:

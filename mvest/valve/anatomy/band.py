@@ -1,16 +1,19 @@
-"""Material coordinates of a triangulated two-leaflet valve, as the template has by construction.
+"""Material coordinates of a triangulated valve, as the template has by construction.
 
 An imported surface has no columns and rows. Its harmonic coordinates provide both: ``s`` runs from
-the annulus (0) to the free edge (1), and ``phi`` (degrees) once around the valve: 0 and 180 on the
-lines between the leaflets, whatever course these take, with the first leaflet in (0, 180). Layered
-meshes, contact samples and chordae can therefore be laid out on any valve as on the template.
+the annulus (0) to the free edge (1), and ``phi`` (degrees) once around the valve. Each of n
+leaflets has a section of ``360 / n`` degrees between the lines to its neighbours, whatever course
+these take, and the first leaflet has the first section. Layered meshes, contact samples and chordae
+can therefore be laid out on any valve as on the template.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from mvest.errors import GeometryError, InputError
+from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve, sampled_valve
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
@@ -29,29 +32,30 @@ Located = tuple[IntArray, FloatArray]
 
 
 class Band:
-    """Material coordinates of a valve with two leaflets.
+    """Material coordinates of a valve.
 
     Parameters
     ----------
     valve : Valve
         Its surface is one band between annulus and free edge, with normals to the ventricle.
 
+    Attributes
+    ----------
+    region_names : tuple of str
+        Those of the valve.
+    sections : tuple of int
+        The leaflet, an index into ``region_names``, of each section of phi; the first one is 0. The
+        leaflets may be named in any order.
+
     Raises
     ------
-    InputError
-        If the valve does not have two leaflets.
     GeometryError
-        If the surface is no band, or the leaflets do not meet along two lines from annulus to free
-        edge.
+        If the surface is no band, or the leaflets do not meet along as many lines from annulus to
+        free edge, each between two neighbours.
     """
 
     def __init__(self, valve: Valve) -> None:
         surface = valve.surface
-        if len(surface.region_names) != 2:
-            raise InputError(
-                f"material coordinates of {len(surface.region_names)} leaflets "
-                f"({', '.join(surface.region_names)}); expected 2"
-            )
         self.valve = valve
         self.region_names = surface.region_names
         self._coordinates: SurfaceCoordinates = surface_coordinates(
@@ -60,68 +64,81 @@ class Band:
         # phi runs so that (along the leaflet) x (along phi) points to the ventricle. Triangles,
         # whose normals do so too, then run clockwise in the plane of (phi, s).
         self._sign = 1.0 if self._coordinates.clockwise else -1.0
-        self._lines = self._leaflet_lines(surface)
+        between = edges_between(surface.triangles, surface.region)
+        self._between = np.isin(np.arange(len(surface.vertices)), between)
+        self._lines = self._leaflet_lines(between)
+        self.sections = self._leaflets_behind(surface.region)
+        first = self.sections.index(0)
+        self._lines = self._lines[first:] + self._lines[:first]
+        self.sections = self.sections[first:] + self.sections[:first]
+        self._width = 360.0 / len(self.sections)
         self._normals = leaflet_normals(surface)
 
-    def _leaflet_lines(self, surface: LeafletSurface) -> list[FloatArray]:
-        """The lines at phi = 0 and 180 as ``(k, 2)`` of s and theta.
+    def _leaflet_lines(self, between: IntArray) -> list[FloatArray]:
+        """The lines between leaflets as ``(k, 2)`` of s and theta, in the order around the valve.
 
-        Theta runs as phi does, and is unwrapped along each line.
+        Theta runs as phi does, and is unwrapped along each line. ``between (e, 2)`` are the edges
+        on which leaflets meet. One leaflet alone begins and ends at an angle of 0.
         """
-        between = np.unique(edges_between(surface.triangles, surface.region))
-        self._between = np.isin(np.arange(len(surface.vertices)), between)
-        if not between.size:
-            raise GeometryError("the two leaflets do not touch: no line between them")
-        theta = np.mod(self._sign * self._coordinates.theta[between], 2 * np.pi)
-        s = self._coordinates.s[between]
-        # The two widest gaps of theta separate the lines.
-        order = np.argsort(theta)
-        gaps = np.diff(np.concatenate([theta[order], theta[order[:1]] + 2 * np.pi]))
-        cuts = np.sort(np.argsort(gaps)[-2:])
-        first = order[cuts[0] + 1 : cuts[1] + 1]
+        names = self.region_names
+        if len(names) == 1:
+            return [np.array([[0.0, 0.0], [1.0, 0.0]])]
+        count = len(self._between)
+        edges = coo_array((np.ones(len(between)), between.T), shape=(count, count))
+        piece = connected_components(edges, directed=False)[1]
+        theta, s = np.mod(self._sign * self._coordinates.theta, 2 * np.pi), self._coordinates.s
         lines = []
-        for members in (first, np.setdiff1d(order, first)):
+        for number in np.unique(piece[between]):
+            members = np.flatnonzero(piece == number)
             along = members[np.argsort(s[members])]
-            if len(along) < 2 or s[along[0]] > 1e-6 or s[along[-1]] < 1 - 1e-6:
-                raise GeometryError(
-                    "the leaflets do not meet along two lines from the annulus to the free edge"
-                )
-            angle = np.unwrap(theta[along])
-            _, once = np.unique(s[along], return_index=True)
-            lines.append(np.column_stack([s[along][once], angle[once]]))
-        start, end = (line[0, 1] for line in lines)
-        middle = start + 0.5 * np.mod(end - start, 2 * np.pi)
-        triangle, _ = self._coordinates.locate(
-            np.mod(self._sign * np.array([middle]), 2 * np.pi), np.array([0.5])
-        )
-        return lines if surface.region[triangle[0]] == 0 else lines[::-1]
+            if s[along[0]] < 1e-6 and s[along[-1]] > 1 - 1e-6:
+                _, once = np.unique(s[along], return_index=True)
+                lines.append(np.column_stack([s[along], np.unwrap(theta[along])])[once])
+        if len(lines) != len(names):
+            raise GeometryError(
+                f"{len(lines)} lines between leaflets from the annulus to the free edge, expected "
+                f"{len(names)}: each of {', '.join(names)} meets the next one along a line"
+            )
+        return sorted(lines, key=lambda line: float(line[0, 1]))
 
-    def _first_leaflet(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Angle at which the first leaflet starts, and its extent, ``(k,)`` rad at ``s (k,)``."""
-        zero, half = (np.interp(s, line[:, 0], line[:, 1]) for line in self._lines)
-        return zero, np.mod(half - zero, 2 * np.pi)
+    def _leaflets_behind(self, region: IntArray) -> tuple[int, ...]:
+        """The leaflet that follows each line, of the regions ``(m,)`` of the triangles."""
+        begin, extent = self._extents(np.array([0.5]))
+        theta = np.mod(self._sign * (begin + 0.5 * extent)[:, 0], 2 * np.pi)
+        triangle, _ = self._coordinates.locate(theta, np.full(len(theta), 0.5))
+        behind = tuple(region[triangle].tolist())
+        if len(set(behind)) != len(self.region_names):
+            listed = ", ".join(self.region_names[k] for k in behind)
+            raise GeometryError(f"the leaflets around the valve are {listed}; expected each once")
+        return behind
+
+    def _extents(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Angle from which each section runs, and its extent, ``(n, k)`` rad at ``s (k,)``."""
+        theta = np.stack([np.interp(s, line[:, 0], line[:, 1]) for line in self._lines])
+        extent = np.mod(np.diff(theta, axis=0), 2 * np.pi)
+        before = np.concatenate([np.zeros_like(theta[:1]), np.cumsum(extent, axis=0)])
+        return theta[0] + before, np.concatenate([extent, 2 * np.pi - before[-1:]])
 
     def locate(self, phi: FloatArray, s: FloatArray) -> Located:
         """Triangles and barycentric weights of material points, given in arrays of any shape."""
         phi, s = np.broadcast_arrays(np.asarray(phi, float), np.asarray(s, float))
-        turns, flat = np.mod(phi.ravel(), 360.0) / 180.0, np.clip(s.ravel(), 0.0, 1.0)
-        zero, first = self._first_leaflet(flat)
-        theta = np.where(
-            turns <= 1.0, zero + turns * first, zero + first + (turns - 1.0) * (2 * np.pi - first)
-        )
+        turns, flat = np.mod(phi.ravel(), 360.0) / self._width, np.clip(s.ravel(), 0.0, 1.0)
+        begin, extent = self._extents(flat)
+        section = np.minimum(turns.astype(np.int64), len(extent) - 1)
+        at = section, np.arange(len(flat))
+        theta = begin[at] + (turns - section) * extent[at]
         triangle, weights = self._coordinates.locate(np.mod(self._sign * theta, 2 * np.pi), flat)
         return triangle.reshape(phi.shape), weights.reshape(*phi.shape, 3)
 
     def coordinates(self) -> tuple[FloatArray, FloatArray]:
         """``phi`` (degrees) and ``s`` of the surface's vertices, ``(n,)`` each."""
         s = self._coordinates.s
-        zero, first = self._first_leaflet(s)
-        theta = np.mod(self._sign * self._coordinates.theta - zero, 2 * np.pi)
-        phi = np.where(
-            theta <= first,
-            180.0 * theta / first,
-            180.0 + 180.0 * (theta - first) / (2 * np.pi - first),
-        )
+        begin, extent = self._extents(s)
+        theta = np.mod(self._sign * self._coordinates.theta - begin[0], 2 * np.pi)
+        before = np.cumsum(extent, axis=0) - extent
+        section = (theta > before[1:]).sum(axis=0)
+        at = section, np.arange(len(s))
+        phi = self._width * section + self._width * (theta - before[at]) / extent[at]
         return np.mod(phi, 360.0), s
 
     def position(
@@ -147,12 +164,12 @@ class Band:
 
     def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
         """Unit fibre directions ``(..., 3)`` as seen from the leaflet ``region``."""
-        region, phi = np.asarray(region), np.mod(phi, 360.0)
-        # The second leaflet ends at 360 and not at 0.
-        phi = np.where((region == 1) & (phi < 90.0), 360.0, phi)
-        low, high = 180.0 * region + INSIDE, 180.0 * (region + 1) - INSIDE
+        section, phi = np.argsort(self.sections)[region], np.mod(phi, 360.0)
+        begin, end = self._width * section, self._width * (section + 1)
+        # The last section ends at 360 and not at 0.
+        phi = np.where((end > 359.0) & (phi < begin - 0.5 * (360.0 - self._width)), 360.0, phi)
         surface = self.valve.surface
-        triangle, weights = self.locate(np.clip(phi, low, high), s)
+        triangle, weights = self.locate(np.clip(phi, begin + INSIDE, end - INSIDE), s)
         corners = surface.fibre[surface.triangles[triangle]]
         # A vertex between leaflets has the fibre of one of them, and which one is unknown.
         inner = np.where(self._between[surface.triangles[triangle]], 0.0, weights)

@@ -93,6 +93,7 @@ class Template:
     def __init__(self, parameters: TemplateParameters | None = None) -> None:
         self.parameters = parameters or TemplateParameters()
         self.region_names: tuple[str, ...] = REGIONS
+        self.sections: tuple[int, ...] = (ANTERIOR, POSTERIOR)
 
     # -- surface ----------------------------------------------------------------------------------
     def annulus(self, phi: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ failed check names the field and the entry.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
@@ -73,11 +73,12 @@ class BandGrid(NamedTuple):
     region: IntArray
 
 
-def band_grid(columns: int, rows: int, leaflets: int = 2) -> BandGrid:
+def band_grid(columns: int, rows: int, sections: Sequence[int] = (0, 1)) -> BandGrid:
     """A grid of ``columns x rows`` vertices from annulus to free edge, equal columns per leaflet.
 
     Vertex ``j * columns + i`` is column i, row j: the first row is the annulus, the last one the
     free edge. Normals of triangles point to the ventricle where phi runs as in the template.
+    ``sections`` are those of `MaterialSurface`.
     """
     i, j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows)))
     cell_i, cell_j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows - 1)))
@@ -88,7 +89,7 @@ def band_grid(columns: int, rows: int, leaflets: int = 2) -> BandGrid:
         phi=360.0 * i / columns,
         s=j / (rows - 1),
         triangles=np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)]),
-        region=np.tile(leaflets * cell_i // columns, 2),
+        region=np.tile(np.array(sections)[len(sections) * cell_i // columns], 2),
     )
 
 
@@ -361,11 +362,15 @@ class Valve:
 
 
 class MaterialSurface(Protocol):
-    """A valve in material coordinates; leaflet k of n has phi from ``360 k / n`` degrees on."""
+    """A valve in material coordinates, where each of n leaflets has ``360 / n`` degrees of phi."""
 
     @property
     def region_names(self) -> tuple[str, ...]:
         """Names of the leaflets."""
+
+    @property
+    def sections(self) -> tuple[int, ...]:
+        """The leaflet in each section of phi, an index into ``region_names``."""
 
     def position(
         self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
@@ -402,14 +407,14 @@ def sampled_valve(
     InputError
         If the numbers are too small or do not divide among the leaflets.
     """
-    leaflets = len(shape.region_names)
+    sections, leaflets = np.array(shape.sections), len(shape.sections)
     if columns < 8 or columns % leaflets or rows < 3:
         raise InputError(
             f"valve of {columns} x {rows} vertices, expected a multiple of {leaflets} >= 8 x >= 3"
         )
-    phi, s, triangles, region = band_grid(columns, rows, leaflets)
+    phi, s, triangles, region = band_grid(columns, rows, shape.sections)
     # A vertex between two leaflets belongs to the later one, at phi = 0 to the last one.
-    of_vertex = np.where(phi > 0, (phi * leaflets / 360.0).astype(np.int64), leaflets - 1)
+    of_vertex = sections[np.where(phi > 0, (phi * leaflets / 360.0).astype(np.int64), -1)]
     surface = LeafletSurface(
         shape.position(phi, s),
         triangles,

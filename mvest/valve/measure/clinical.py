@@ -12,8 +12,8 @@ annulus centre that holds its normal and the anterior direction.
 * ``prolapse``: leaflets above the annulus plane (a saddle-shaped annulus has some of it in every
   valve: Levine et al. 1987, Circulation 75:756); ``billow``: above the minimal surface instead.
 * ``orifice``: area within the annulus that no leaflet covers seen along the normal.
-* ``coaptation_length``: over which the leaflets touch in the middle section, the smaller of both;
-  ``coaptation_area``: mean of both leaflets.
+* ``coaptation_length``: over which two leaflets touch in the middle section, the smaller of both;
+  ``coaptation_area``: over which leaflets touch, half the sum over all of them.
 * ``length`` of a leaflet: from annulus to free edge in the middle section.
 * ``tip_depth``, ``tip_annulus_distance``: means over the papillary tips, the latter to the nearest
   annulus points; ``tip_separation``: between the tips.
@@ -118,20 +118,19 @@ def clinical_measurements(
         if the annulus has no plane.
     """
     try:
-        plane = _plane(vertices, surface, annulus, tips)
+        plane = plane_of_leaflets(vertices, surface, annulus, tips)
     except MvestError:
         return {}
     triangles, region = surface.triangles, np.asarray(surface.region)
-    pair = [triangles[region == number] for number in range(len(surface.region_names))]
+    leaflets = [triangles[region == number] for number in range(len(surface.region_names))]
     seen = vertices, triangles, annulus, plane
     numbers = _tried(_annulus, annulus, plane)
     numbers |= _tried(tenting, *seen)
     numbers |= _tried(_prolapse, *seen)
-    if len(pair) == 2:
-        numbers |= _tried(closure, *seen, pair, contact_distance)
-    for name, own in zip(surface.region_names, pair, strict=True):
+    numbers |= _tried(closure, *seen, leaflets, contact_distance)
+    for name, own in zip(surface.region_names, leaflets, strict=True):
         numbers[f"{name}_area_mm2"] = float(areas(vertices, own).sum())
-        if len(pair) == 2:
+        if len(leaflets) == 2:
             numbers[f"{name}_length_mm"] = leaflet_length(vertices, own, plane)
     return numbers | _tips(tips, annulus, plane, tip_names)
 
@@ -141,15 +140,16 @@ def annulus_and_tips(
 ) -> Numbers:
     """The measurements of `clinical_measurements` that need no leaflets, a hundred times faster."""
     try:
-        plane = _plane(vertices, surface, annulus, tips)
+        plane = plane_of_leaflets(vertices, surface, annulus, tips)
     except MvestError:
         return {}
     return _tried(_annulus, annulus, plane) | _tips(tips, annulus, plane, ())
 
 
-def _plane(
+def plane_of_leaflets(
     vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, tips: FloatArray
 ) -> AnnulusPlane:
+    """Plane of an annulus ``(k, 3)`` mm; leaflets and tips ``(t, 3)`` mm tell its sides."""
     # The middle of a leaflet's own annulus is nearest to that leaflet.
     first = np.unique(surface.triangles[surface.region == 0])
     gap = np.linalg.norm(annulus[:, None] - vertices[first][None], axis=2).min(axis=1)
@@ -234,26 +234,25 @@ def closure(
     triangles: IntArray,
     annulus: FloatArray,
     plane: AnnulusPlane,
-    pair: Sequence[IntArray],
+    leaflets: Sequence[IntArray],
     reach: float,
 ) -> Numbers:
-    """Orifice and coaptation of two leaflets.
+    """Orifice and coaptation; the middle section of two leaflets alone shows how long they touch.
 
     Parameters
     ----------
     vertices, triangles, annulus, plane
         As in `tenting`.
-    pair : two (m, 3) arrays
-        Triangles of the anterior and of the posterior leaflet.
+    leaflets : sequence of (m, 3) arrays
+        Triangles of each leaflet, the anterior one first.
     reach : float
         mm between midsurfaces that count as touching.
     """
-    first, second = pair
-    return {
-        "orifice_mm2": orifice_area(vertices, triangles, annulus, plane),
-        "coaptation_length_mm": coaptation_length(vertices, first, second, plane, reach),
-        "coaptation_area_mm2": coaptation_area(vertices, first, second, reach),
-    }
+    numbers = {"orifice_mm2": orifice_area(vertices, triangles, annulus, plane)}
+    if len(leaflets) == 2:
+        length = coaptation_length(vertices, leaflets[0], leaflets[1], plane, reach)
+        numbers["coaptation_length_mm"] = length
+    return numbers | {"coaptation_area_mm2": coaptation_area(vertices, leaflets, reach)}
 
 
 def leaflet_length(vertices: FloatArray, triangles: IntArray, plane: AnnulusPlane) -> float:

@@ -10,6 +10,7 @@ distance at which two of them touch.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,12 @@ from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.geometry.proximity import closest_points, plane_section
+from mvest.valve.geometry.proximity import (
+    closest_on_triangle,
+    closest_points,
+    plane_section,
+    row,
+)
 from mvest.valve.geometry.triangles import areas, unit_normals
 from mvest.valve.measure.annulus import AnnulusPlane
 
@@ -203,48 +209,110 @@ def coaptation_length(
     sampling
         mm between the tested points of a section.
     """
-    lengths = []
-    for own, other in ((first, second), (second, first)):
-        segments, triangle = plane_section(vertices, own, plane.origin, plane.lateral)
-        size = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
-        pieces = np.maximum(np.ceil(size / sampling), 1).astype(np.int64)
-        owner = np.repeat(np.arange(len(segments)), pieces)
-        position = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        fraction = ((position + 0.5) / pieces[owner])[:, None]
-        points = segments[owner, 0] * (1 - fraction) + segments[owner, 1] * fraction
-        near = _in_contact(
-            points,
-            unit_normals(vertices, own)[triangle[owner]],
-            vertices,
-            other,
-            contact_distance,
+    pair = (first, second), (second, first)
+    sections = [_touching(vertices, *s, plane, contact_distance, sampling) for s in pair]
+    return min(float(length.sum()) for _, length in sections)
+
+
+def coaptation_depth(
+    vertices: FloatArray,
+    first: IntArray,
+    second: IntArray,
+    plane: AnnulusPlane,
+    contact_distance: float,
+) -> float:
+    """Depth (mm) below the annulus plane where two leaflets first touch, seen from the atrium.
+
+    In the middle anteroposterior plane, the mean of both leaflets' least depths; NaN if they do not
+    touch there. This is the tenting height of echocardiography, which measures to the coaptation
+    point. Parameters as in `coaptation_length`.
+    """
+    pair = (first, second), (second, first)
+    points = [_touching(vertices, *s, plane, contact_distance, 0.02)[0] for s in pair]
+    if not all(len(own) for own in points):
+        return float("nan")
+    return float(np.mean([plane.coordinates(own)[:, 2].min() for own in points]))
+
+
+def _touching(
+    vertices: FloatArray,
+    own: IntArray,
+    other: IntArray,
+    plane: AnnulusPlane,
+    contact_distance: float,
+    sampling: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Points ``(k, 3)`` of a leaflet's section that touch the other one, and lengths ``(k,)``."""
+    segments, triangle = plane_section(vertices, own, plane.origin, plane.lateral)
+    size = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+    pieces = np.maximum(np.ceil(size / sampling), 1).astype(np.int64)
+    owner = np.repeat(np.arange(len(segments)), pieces)
+    position = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    fraction = ((position + 0.5) / pieces[owner])[:, None]
+    points = segments[owner, 0] * (1 - fraction) + segments[owner, 1] * fraction
+    normals = unit_normals(vertices, own)[triangle[owner]]
+    near = _in_contact(points, normals, vertices, other, contact_distance)
+    return points[near], (size / pieces)[owner][near]
+
+
+def touching_triangles(
+    vertices: FloatArray, triangles: IntArray, contact_distance: float
+) -> BoolArray:
+    """Which triangles ``(m,)`` touch a leaflet that faces them, another one or their own in a fold.
+
+    Those whose centroid is within the distance (mm) of a triangle with a normal more than 90° away.
+    """
+    corners = vertices[triangles]
+    centroids, normals = corners.mean(axis=1), unit_normals(vertices, triangles)
+    size = float(np.linalg.norm(corners - centroids[:, None], axis=2).max())
+    pairs = cKDTree(centroids).query_pairs(contact_distance + size, output_type="ndarray")
+    pairs = pairs[np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) < 0]
+    both = np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64)
+    gap = _distances(centroids, vertices, np.asarray(triangles, np.int64), both)
+    touching = np.zeros(len(triangles), dtype=np.bool_)
+    touching[both[gap <= contact_distance, 0]] = True
+    return touching
+
+
+@njit(cache=True)
+def _distances(
+    points: FloatArray, vertices: FloatArray, triangles: IntArray, pairs: IntArray
+) -> FloatArray:
+    """Distances ``(k,)`` of a point from a triangle, for pairs ``(k, 2)`` of both."""
+    out = np.empty(len(pairs))
+    for k in range(len(pairs)):
+        a, b, c = triangles[pairs[k, 1]]
+        p = points[pairs[k, 0]]
+        u, v, w = closest_on_triangle(
+            row(points, pairs[k, 0]), row(vertices, a), row(vertices, b), row(vertices, c)
         )
-        lengths.append(float((size / pieces)[owner][near].sum()))
-    return min(lengths)
+        out[k] = np.sqrt(np.sum((p - u * vertices[a] - v * vertices[b] - w * vertices[c]) ** 2))
+    return out
 
 
 def coaptation_area(
     vertices: FloatArray,
-    first: IntArray,
-    second: IntArray,
+    leaflets: Sequence[IntArray],
     contact_distance: float,
     subdivisions: int = 3,
 ) -> float:
-    """Area (mm²) over which two leaflets touch.
+    """Area (mm²) over which leaflets touch.
 
-    Mean of both leaflets' areas within `contact_distance` of the other and facing it. Each triangle
-    is cut into ``subdivisions²`` equal parts. Parameters as in `coaptation_length`.
+    Half the sum of the leaflets' areas within `contact_distance` of another leaflet and facing it.
+    Each triangle is cut into ``subdivisions²`` equal parts. ``leaflets`` are triangles of each, the
+    other parameters as in `coaptation_length`.
     """
     weights = _part_centroids(subdivisions)
     touching = []
-    for own, other in ((first, second), (second, first)):
+    for k, own in enumerate(leaflets):
+        other = np.concatenate([own[:0], *leaflets[:k], *leaflets[k + 1 :]])
         corners = vertices[own]
         points = np.einsum("qk,mkd->mqd", weights, corners).reshape(-1, 3)
         normals = np.repeat(unit_normals(vertices, own), len(weights), axis=0)
         near = _in_contact(points, normals, vertices, other, contact_distance)
         part = np.repeat(areas(vertices, own) / len(weights), len(weights))
         touching.append(float(part[near].sum()))
-    return 0.5 * (touching[0] + touching[1])
+    return 0.5 * sum(touching)
 
 
 def _part_centroids(n: int) -> FloatArray:

@@ -1,6 +1,8 @@
-"""Membrane strain of leaflets between two shapes of one surface."""
+"""Membrane strain of leaflets between two shapes of one surface, and quantiles by area."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -9,12 +11,11 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.triangles import areas, unit_normals, unit_rows
 
 
-def mean_strains(rest: FloatArray, deformed: FloatArray, surface: LeafletSurface) -> FloatArray:
-    """Mean nominal strain ``(regions, 2)`` of each leaflet, along and across its fibres.
+def triangle_strains(rest: FloatArray, deformed: FloatArray, surface: LeafletSurface) -> FloatArray:
+    """Nominal strain ``(m, 2)`` of each triangle, along and across its fibres.
 
-    Of a triangle it is the change in length, per length, of a line that lies along or across the
-    fibres at rest: from its in-plane deformation gradient F, ``|F a| - 1``. Means are over the area
-    at rest.
+    It is the change in length, per length, of a line that lies along or across the fibres at rest:
+    from the in-plane deformation gradient F, ``|F a| - 1``.
 
     Parameters
     ----------
@@ -35,10 +36,28 @@ def mean_strains(rest: FloatArray, deformed: FloatArray, surface: LeafletSurface
         )
 
     in_plane = np.linalg.inv(np.swapaxes(axes, 1, 2) @ edges(rest))
-    stretch = np.linalg.norm(edges(deformed) @ in_plane, axis=1)
-    weight = areas(rest, corners)
+    return np.asarray(np.linalg.norm(edges(deformed) @ in_plane, axis=1) - 1.0)
+
+
+def mean_strains(rest: FloatArray, deformed: FloatArray, surface: LeafletSurface) -> FloatArray:
+    """Mean of `triangle_strains` over each leaflet's area at rest, ``(regions, 2)``."""
+    strain, weight = triangle_strains(rest, deformed, surface), areas(rest, surface.triangles)
     regions = range(len(surface.region_names))
     return np.stack(
-        [np.average(stretch[own], axis=0, weights=weight[own]) - 1.0
+        [np.average(strain[own], axis=0, weights=weight[own])
          for own in (surface.region == r for r in regions)]
     )  # fmt: skip
+
+
+def weighted_quantiles(
+    values: FloatArray, weights: FloatArray, shares: Sequence[float]
+) -> list[float]:
+    """Smallest values such that the ``shares`` of the total weight do not exceed them.
+
+    ``values`` and ``weights`` have the same shape, and at least one entry.
+    """
+    order = np.argsort(values, axis=None)
+    below = np.cumsum(weights.ravel()[order])
+    # Round-off in the sum must not lift a share of one beyond the last value.
+    at = np.searchsorted(below, np.asarray(shares) * below[-1])
+    return [float(value) for value in values.ravel()[order[at]]]

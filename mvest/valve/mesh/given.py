@@ -1,8 +1,8 @@
 """Sampling and meshing of a valve that is given as a surface.
 
-With material coordinates it is meshed in layers like the template. Otherwise its thickened leaflets
-are meshed with tetrahedra. The mesher keeps neither vertices nor labels, so these are transferred
-by nearness: regions and fibres from the midsurface, pressure faces from the closed surface.
+In material coordinates it is meshed in layers like the template, or its thickened leaflets are
+meshed with tetrahedra. That mesher keeps neither vertices nor labels, so these are transferred by
+nearness: regions and fibres from the midsurface, pressure faces from the closed surface.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError, MeshingError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.band import Band, leaflet_normals
+from mvest.valve.anatomy.band import Band
 from mvest.valve.anatomy.valve import LeafletSurface, Valve, band_grid
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.thickening import FACE_KINDS, ClosedSurface, thicken
@@ -26,35 +26,22 @@ from mvest.valve.mesh.tetwild import tetrahedralize
 
 
 class GivenValve:
-    """An imported valve in any resolution, and its meshes.
-
-    A valve with two leaflets has material coordinates (`mvest.valve.anatomy.band.Band`) and can be
-    meshed in layers. Any other valve keeps its given surface and has unstructured meshes.
-    """
+    """An imported valve in any resolution, and its meshes in layers."""
 
     def __init__(self, given: Valve) -> None:
         self.given = given
-        self.region_names = given.surface.region_names
 
     @cached_property
-    def band(self) -> Band | None:
-        """Material coordinates of a valve with two leaflets.
-
-        Raises
-        ------
-        GeometryError
-            If the leaflets do not meet along two lines from annulus to free edge.
-        """
-        return Band(self.given) if len(self.region_names) == 2 else None
+    def band(self) -> Band:
+        """Material coordinates; GeometryError if the leaflets do not meet along lines."""
+        return Band(self.given)
 
     def valve(self, columns: int, rows: int) -> Valve:
-        """The valve on ``columns x rows`` vertices, or as given without material coordinates."""
-        return self.given if self.band is None else self.band.sampled(columns, rows)
+        """The valve on ``columns x rows`` vertices."""
+        return self.band.sampled(columns, rows)
 
     def normals(self, columns: int, rows: int) -> FloatArray:
         """Directions ``(n, 3)`` of the thickness at the vertices of `valve`."""
-        if self.band is None:
-            return leaflet_normals(self.given.surface)
         grid = band_grid(columns, rows)
         return self.band.normal(grid.phi, grid.s)
 
@@ -63,21 +50,15 @@ class GivenValve:
 
         Raises
         ------
-        InputError
-            If there are not two leaflets.
         GeometryError
             If cells are folded.
         """
-        if self.band is None:
-            raise InputError(
-                "a structured mesh needs a valve with two leaflets; expected mesh source tetwild"
-            )
         try:
             return structured_mesh(self.band, element, columns, rows, layers)
         except GeometryError as fault:
             raise GeometryError(
                 f"structured mesh of {columns} x {rows} cells: {fault}; the reference "
-                "surface or the line between its leaflets is too jagged: smooth it, change the "
+                "surface or a line between its leaflets is too jagged: smooth it, change the "
                 "number of cells, or take mesh source tetwild"
             ) from fault
 

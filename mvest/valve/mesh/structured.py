@@ -41,7 +41,7 @@ def structured_mesh(
     GeometryError
         If cells are inverted.
     """
-    leaflets = len(shape.region_names)
+    leaflets = len(shape.sections)
     if columns < 6 or columns % leaflets or rows < 1 or layers < 1:
         raise InputError(
             f"mesh of {columns} x {rows} x {layers} cells, expected a multiple of {leaflets} >= 6 "
@@ -58,7 +58,7 @@ def structured_mesh(
     nodes = shape.position(
         360.0 * at[:, 0] / steps[0], at[:, 1] / steps[1], -1 + 2.0 * at[:, 2] / steps[2]
     )
-    region = leaflets * grid[..., 0].min(axis=1) // steps[0]
+    region = np.array(shape.sections)[leaflets * grid[..., 0].min(axis=1) // steps[0]]
     of_node = np.broadcast_to(region[:, None], elements.shape)
     fibre = shape.fibre(360.0 * grid[..., 0] / steps[0], grid[..., 1] / steps[1], of_node)
     on_top = at[:, 2] == steps[2]

@@ -69,7 +69,9 @@ def test_the_modulus_is_the_same_in_every_mesh(basis):
 def varied(base, mesh, modes, coefficients):
     variation = ModulusVariation(modes)
     values = {f"field.tissue.{k}": a for k, a in enumerate(coefficients)}
-    return LeafletLaw((base,), mesh.region, np.ones(1), variation.scale(values), variation)
+    return LeafletLaw(
+        (base,), mesh.region, np.eye(6)[None, None], variation.scale(values), variation
+    )
 
 
 def test_derivatives_of_the_scaled_stress_agree_with_differences():

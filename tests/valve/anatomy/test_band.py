@@ -1,16 +1,19 @@
 """Material coordinates of a triangulated valve: where they must agree with geometry."""
 
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
 
-from mvest.errors import GeometryError, InputError
+from mvest.errors import GeometryError
 from mvest.valve.anatomy.band import Band
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import LeafletSurface, Motion, Valve
+from mvest.valve.geometry.triangles import areas, edges_between
 from mvest.valve.mesh.solid_mesh import jacobian_determinants
 from mvest.valve.mesh.structured import structured_mesh
+from tests.three_leaflets import ThreeLeaflets
 
 TEMPLATE = Template()
 
@@ -100,18 +103,101 @@ def test_fibres_are_those_of_the_leaflet_they_are_asked_of(valve, band):
     np.testing.assert_allclose(np.linalg.norm(fibres, axis=1), 1)
 
 
-def test_a_valve_of_three_leaflets_is_refused(valve):
-    surface = valve.surface
-    region = surface.region.copy()
-    region[: len(region) // 5] = 2
-    three = replace(surface, region=region, region_names=("a", "b", "c"))
-    with pytest.raises(InputError, match="of 3 leaflets"):
-        Band(replace(valve, surface=three))
+@pytest.fixture(scope="module")
+def three():
+    return ThreeLeaflets().valve()
 
 
-def test_leaflets_that_do_not_meet_from_edge_to_edge_are_refused(valve):
-    surface = valve.surface
-    island = np.zeros_like(surface.region)
-    island[len(island) // 4] = 1
-    with pytest.raises(GeometryError, match="two lines"):
-        Band(replace(valve, surface=replace(surface, region=island)))
+def between_thirds(phi):
+    """Distances in degrees from the nearest of 0, 120 and 240 degrees."""
+    return np.abs((phi + 60.0) % 120.0 - 60.0)
+
+
+def test_each_of_three_leaflets_has_a_third_of_the_angle(three):
+    phi, s = Band(three).coordinates()
+    surface = three.surface
+    np.testing.assert_allclose(Band(three).position(phi, s), surface.vertices, atol=1e-9)
+    # Around the valve they are the anterior, the posterior and the septal one.
+    for number, begin in ((0, 0.0), (1, 240.0), (2, 120.0)):
+        own = np.setdiff1d(
+            surface.triangles[surface.region == number],
+            surface.triangles[surface.region != number],
+        )
+        assert np.all((phi[own] > begin) & (phi[own] < begin + 120.0))
+    lines = np.unique(edges_between(surface.triangles, surface.region))
+    assert between_thirds(phi[lines]).max() < 1e-9
+
+
+def relabelled(valve: Valve, region, names=("a", "b", "c")) -> Valve:
+    """The valve with other leaflets."""
+    return replace(valve, surface=replace(valve.surface, region=region, region_names=names))
+
+
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+def test_names_in_any_order_are_those_of_the_same_leaflets(three, order):
+    surface = three.surface
+    names = tuple(surface.region_names[k] for k in order)
+    band = Band(relabelled(three, np.argsort(order)[surface.region], names))
+    sampled, mesh = band.sampled(60, 25).surface, structured_mesh(band, "hex18", 24, 3)
+    assert sampled.region_names == mesh.region_names == names
+    for number, name in enumerate(names):
+        own, same = (
+            areas(one.vertices, one.triangles[one.region == one.region_names.index(name)]).sum()
+            for one in (sampled, surface)
+        )
+        assert own == pytest.approx(same, rel=0.01)
+        x, y, _ = mesh.nodes[mesh.elements[mesh.region == number]].mean(axis=(0, 1))
+        assert {"anterior": y > 5, "septal": x > 5, "posterior": x < -5}[name]
+
+
+@pytest.mark.parametrize("element", ["hex18", "tet10"])
+def test_a_mesh_of_three_leaflets_is_the_body_of_its_shape(three, element):
+    mesh, like = (structured_mesh(s, element, 24, 4) for s in (Band(three), ThreeLeaflets()))
+    assert np.array_equal(mesh.region, like.region)
+    points, weights = mesh.reference.points, mesh.reference.weights
+    dets = [jacobian_determinants(m.nodes, m.elements, m.reference, points) for m in (mesh, like)]
+    assert min(det.min() for det in dets) > 0
+    assert (dets[0] @ weights).sum() == pytest.approx((dets[1] @ weights).sum(), rel=0.01)
+
+
+def middles(valve: Valve):
+    """``phi`` and ``s`` of the triangles' centroids."""
+    phi, s = (own[valve.surface.triangles] for own in Band(valve).coordinates())
+    turned = np.where((phi < 90.0) & (phi.max(axis=1, keepdims=True) > 270.0), phi + 360.0, phi)
+    return turned.mean(axis=1), s.mean(axis=1)
+
+
+def test_lines_of_any_course_are_found(three):
+    # They wind by more than a leaflet's own angle, so that all angles are on some line.
+    phi, s = middles(three)
+    region = (np.mod(phi - 130.0 * s, 360.0) // 120.0).astype(int)
+    wound = relabelled(three, region)
+    own, _ = Band(wound).coordinates()
+    lines = np.unique(edges_between(three.surface.triangles, region))
+    assert between_thirds(own[lines]).max() < 2 * 360.0 / 108  # columns
+    assert Band(wound).sections == (0, 1, 2)
+
+
+def test_one_leaflet_alone_has_the_whole_angle(three):
+    band = Band(relabelled(three, 0 * three.surface.region, ("whole",)))
+    phi, s = band.coordinates()
+    np.testing.assert_allclose(band.position(phi, s), three.surface.vertices, atol=1e-9)
+    mesh = structured_mesh(band, "hex18", 25, 3)
+    assert mesh.region_names == ("whole",)
+    # The fibre of the last column is the one beyond 0 degrees.
+    step = 360.0 / 50
+    fibres = [band.fibre(np.array([at]), np.array([0.5]), np.array([0])) for at in (step, -step)]
+    assert abs(np.sum(fibres[0] * fibres[1])) > 0.9
+
+
+def test_leaflets_that_do_not_meet_from_edge_to_edge_are_refused(three):
+    region = np.minimum(three.surface.region, 1)
+    region[len(region) // 4] = 2
+    with pytest.raises(GeometryError, match=r"2 lines between leaflets .* expected 3"):
+        Band(relabelled(three, region))
+
+
+def test_a_leaflet_in_two_pieces_is_refused(three):
+    region = np.array([0, 1, 2, 1])[(middles(three)[0] // 90.0).astype(int) % 4]
+    with pytest.raises(GeometryError, match="are a, b, c, b; expected each once"):
+        Band(relabelled(three, region, ("a", "b", "c", "d")))

@@ -4,7 +4,13 @@ import pytest
 from mvest.errors import GeometryError
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus
 from mvest.valve.measure.clinical import leaflet_length, tenting
-from mvest.valve.measure.coaptation import coaptation_area, coaptation_length, orifice_area
+from mvest.valve.measure.coaptation import (
+    coaptation_area,
+    coaptation_depth,
+    coaptation_length,
+    orifice_area,
+    touching_triangles,
+)
 
 BELOW = np.array([0.0, 0.0, 30.0])
 FRONT = np.array([10.0, 0.0, 1.0])
@@ -75,8 +81,8 @@ def test_coaptation_of_parallel_plates(shapes):
     touching = coaptation_length(vertices, first, second, plane, contact_distance=1.3)
     assert touching == pytest.approx(10.0, abs=1e-9)
     assert coaptation_length(vertices, first, second, plane, 1.1) == 0.0
-    assert coaptation_area(vertices, first, second, 1.3) == pytest.approx(120.0)
-    assert coaptation_area(vertices, first, second, 1.1) == 0.0
+    assert coaptation_area(vertices, [first, second], 1.3) == pytest.approx(120.0)
+    assert coaptation_area(vertices, [first, second], 1.1) == 0.0
     # Turned to face the same way, the two no longer count as opposing.
     assert coaptation_length(vertices, first, second[:, ::-1], plane, 1.3) == 0.0
 
@@ -91,9 +97,44 @@ def test_coaptation_of_a_wedge(shapes):
     plane = plane_of(shapes.circle(15.0))
     length = coaptation_length(vertices, a, b, plane, contact_distance=1.3)
     assert length == pytest.approx(1.3 / np.sin(2 * alpha), abs=0.05)
-    assert coaptation_area(vertices, a, b, 1.3, subdivisions=6) == pytest.approx(
+    assert coaptation_area(vertices, [a, b], 1.3, subdivisions=6) == pytest.approx(
         12 * 1.3 / np.sin(2 * alpha), rel=0.03
     )
+
+
+def test_the_coaptation_point_is_where_leaflets_first_touch(shapes):
+    # The plates of a wedge that is closed below: they come within reach at the distance that is
+    # reach / sin(2 alpha) from their common edge, 12 mm deep.
+    alpha = np.radians(10)
+    along = 10 * np.array([np.sin(alpha), 0, -np.cos(alpha)])
+    first = shapes.plate([0, -6, 12], along, [0, 12, 0], 40)
+    second = shapes.plate([0, -6, 12], [0, 12, 0], along * [-1, 1, 1], 40)
+    vertices, triangles, (a, b) = shapes.join(first, second)
+    plane = plane_of(shapes.circle(15.0))
+    depth = coaptation_depth(vertices, a, b, plane, contact_distance=1.3)
+    assert depth == pytest.approx(12 - 1.3 / np.sin(2 * alpha) * np.cos(alpha), abs=0.05)
+    assert np.isnan(coaptation_depth(vertices, a, b[:, ::-1], plane, 1.3))
+    # As deep, the material that touches: centroids nearer to the edge than the coaptation point.
+    touching = touching_triangles(vertices, triangles, 1.3)
+    z = vertices[triangles].mean(axis=1)[:, 2]
+    assert z[touching].min() == pytest.approx(depth, abs=0.3)
+    assert z[~touching].max() == pytest.approx(depth, abs=0.3)
+
+
+def test_a_leaflet_that_is_folded_touches_itself(shapes):
+    # A sheet folded over itself at x = 0: two flaps 1 mm apart, joined by a half-cylinder.
+    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 13)
+    path = [(-x, -0.5) for x in np.linspace(6, 0.5, 12)]
+    path += [(0.5 * np.cos(a), 0.5 * np.sin(a)) for a in turn]
+    path += [(-x, 0.5) for x in np.linspace(0.5, 6, 12)]
+    vertices, triangles = shapes.plate([0, 0, 0], [len(path) - 1, 0, 0], [0, 3, 0], len(path) - 1)
+    at = np.rint(vertices[:, 0]).astype(int)
+    folded = np.column_stack([np.array(path)[at, 0], vertices[:, 1], np.array(path)[at, 1]])
+    flaps = folded[triangles].mean(axis=1)[:, 0] < -0.2
+    assert touching_triangles(folded, triangles, 1.05)[flaps].all()
+    assert not touching_triangles(folded, triangles, 0.95)[flaps].any()
+    # The flat sheet touches nothing, however far the reach.
+    assert not touching_triangles(vertices, triangles, 3.0).any()
 
 
 @pytest.mark.parametrize(
