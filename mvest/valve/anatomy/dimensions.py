@@ -27,13 +27,13 @@ class AnnulusDimensions:
     """
 
     commissural_diameter: Length = 36.0
-    anteroposterior_diameter: Length = 28.0
-    saddle_height: Place = 8.0  #: extent along the valve's axis
-    commissure_angle: Angle = 22.0  #: parametric angle of the commissures above the x axis
+    anteroposterior_diameter: Length = 24.8
+    saddle_height: Place = 7.7  #: extent along the valve's axis
+    commissure_angle: Angle = 18.0  #: parametric angle of the commissures above the x axis
     #: relative shortening of the annulus until the valve is closed
     commissural_contraction: Share = 0.01
-    anteroposterior_contraction: Share = 0.02
-    saddle_deepening: Share = 0.12  #: relative increase of the height until then
+    anteroposterior_contraction: Share = 0.012
+    saddle_deepening: Share = 0.1  #: relative increase of the height until then
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +55,11 @@ class LeafletPair:
     Thickness is that of the paper.
     """
 
-    anterior: LeafletDimensions = LeafletDimensions(24.0, 1.32, 0.08)
-    posterior: LeafletDimensions = LeafletDimensions(13.0, 1.26, 0.12)
-    commissural_length: Length = 8.5  #: from annulus to free edge at the commissures
+    anterior: LeafletDimensions = LeafletDimensions(24.0, 1.32, 0.11)
+    posterior: LeafletDimensions = LeafletDimensions(13.8, 1.26, 0.07)
+    commissural_length: Length = 9.0  #: from annulus to free edge at the commissures
     indentation: Share = 0.2  #: of the length
-    scallop_bulge: Share = 0.15  #: depth of a scallop's bulge over its length
+    scallop_bulge: Share = 0.09  #: depth of a scallop's bulge over its length
     edge_thinning: Share = 0.75  #: thickness at the free edge over that next to the annulus
     #: share of the anterior leaflet's angle, at each commissure, over which its fibres turn from
     #: parallel to perpendicular to the annulus
@@ -74,14 +74,14 @@ class FreeEdge:
     ``u = 2 x / width``. It defines the rest lengths of the chordae.
     """
 
-    width: Length = 26.0  #: between the commissures
-    commissural_y: Place = 1.5  #: y of the commissures
+    width: Length = 29.0  #: between the commissures
+    commissural_y: Place = 1.4  #: y of the commissures
     #: distance of the middle of the open edge from there along y, towards its own annulus
-    anterior_opening: Place = 0.0
-    posterior_opening: Place = 7.0
-    sag: Place = 7.5
-    depth: Place = 4.0
-    drop: Place = 2.5
+    anterior_opening: Place = 1.0
+    posterior_opening: Place = 5.4
+    sag: Place = 9.5
+    depth: Place = 5.4
+    drop: Place = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class PapillaryPlace:
     """Positions of the papillary tips."""
 
     #: (x, y, z), the tip at positive x; the other one is its mirror image
-    tip: tuple[Place, Place, Place] = (16.0, -0.5, -25.0)
+    tip: tuple[Place, Place, Place] = (17.7, 2.0, -25.3)
     #: (x, y, z), displacement of this tip after the chordae got their lengths; the other tip moves
     #: as its mirror image. The chordae tether the leaflets then, but are never taut in the open
     #: valve.
@@ -145,10 +145,10 @@ class ChordLayout:
     marginal: tuple[Angle, ...] = (-78.0, -52.0, -26.0, 0.0, 26.0, 52.0, 78.0)
     branches: Count = 3
     fan_width: Angle = 17.0
-    basal: tuple[tuple[Angle, Share], ...] = ((-58.0, 0.5), (-12.0, 0.5), (75.0, 0.5))
-    strut: tuple[tuple[Angle, Share], ...] = ((52.0, 0.55),)
+    basal: tuple[tuple[Angle, Share], ...] = ((-58.0, 0.32), (-12.0, 0.32), (76.0, 0.3))
+    strut: tuple[tuple[Angle, Share], ...] = ((44.0, 0.5),)
     stiffness: tuple[Stiffness, Stiffness, Stiffness] = (40.0, 16.0, 35.0)
-    marginal_slack: Factor = 0.985
+    marginal_slack: Factor = 0.96
     basal_slack: Factor = 1.02
     open_slack: Factor = 1.035
     toe_strain: Share = 0.015
