@@ -28,7 +28,7 @@ class AnnulusDimensions:
 
     commissural_diameter: Length = 36.0
     anteroposterior_diameter: Length = 24.8
-    saddle_height: Place = 7.7  #: extent along the valve's axis
+    saddle_height: Place = 7.9  #: extent along the valve's axis
     commissure_angle: Angle = 18.0  #: parametric angle of the commissures above the x axis
     #: relative shortening of the annulus until the valve is closed
     commissural_contraction: Share = 0.01
@@ -55,7 +55,7 @@ class LeafletPair:
     Thickness is that of the paper.
     """
 
-    anterior: LeafletDimensions = LeafletDimensions(24.0, 1.32, 0.11)
+    anterior: LeafletDimensions = LeafletDimensions(23.8, 1.32, 0.11)
     posterior: LeafletDimensions = LeafletDimensions(13.8, 1.26, 0.07)
     commissural_length: Length = 9.0  #: from annulus to free edge at the commissures
     indentation: Share = 0.2  #: of the length
@@ -80,7 +80,7 @@ class FreeEdge:
     anterior_opening: Place = 1.0
     posterior_opening: Place = 5.4
     sag: Place = 9.5
-    depth: Place = 5.4
+    depth: Place = 6.0
     drop: Place = 2.0
 
 
@@ -89,7 +89,7 @@ class PapillaryPlace:
     """Positions of the papillary tips."""
 
     #: (x, y, z), the tip at positive x; the other one is its mirror image
-    tip: tuple[Place, Place, Place] = (17.7, 2.0, -25.3)
+    tip: tuple[Place, Place, Place] = (17.7, 3.0, -25.0)
     #: (x, y, z), displacement of this tip after the chordae got their lengths; the other tip moves
     #: as its mirror image. The chordae tether the leaflets then, but are never taut in the open
     #: valve.
@@ -147,7 +147,7 @@ class ChordLayout:
     fan_width: Angle = 17.0
     basal: tuple[tuple[Angle, Share], ...] = ((-58.0, 0.32), (-12.0, 0.32), (76.0, 0.3))
     strut: tuple[tuple[Angle, Share], ...] = ((44.0, 0.5),)
-    stiffness: tuple[Stiffness, Stiffness, Stiffness] = (40.0, 16.0, 35.0)
+    stiffness: tuple[Stiffness, Stiffness, Stiffness] = (48.0, 16.0, 40.0)
     marginal_slack: Factor = 0.96
     basal_slack: Factor = 1.02
     open_slack: Factor = 1.035
