@@ -272,7 +272,8 @@ def _laid_out(
         goal = coordinates(band)
     chordae = lay_out_chordae(opened, seen.tips, goal, closed.papillary_tips, layout)
     folder.derived.append(
-        f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
+        f"chordae: {len(chordae.insertion)} laid out as in the template, each to its nearer "
+        "papillary tip, "
         f"rest lengths from {how}"
     )
     return chordae

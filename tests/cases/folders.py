@@ -9,6 +9,7 @@ import yaml
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.cases.tissue import LeafletBand
 from mvest.exchange.surfaces import write_surface
+from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
 from mvest.valve.anatomy.template import Template
 
 TIPS = [[16.0, -0.24, -25.0], [-16.0, -0.24, -25.0]]
@@ -21,9 +22,13 @@ def closing(x, share=1.0):
     return x * (1.0 - share * squeeze)
 
 
-def template_case(columns=40, rows=12):
-    """The template, open, closed and held out, with something of its own in every field."""
-    valve = Template().valve(columns, rows)
+def template_case(columns=40, rows=12, branches=3):
+    """The template, open, closed and held out, with something of its own in every field.
+
+    Its marginal chordae have so many branches.
+    """
+    layout = replace(ChordLayout(), branches=branches)
+    valve = Template(TemplateParameters(chordae=layout)).valve(columns, rows)
     surface = valve.surface
 
     def frame(name, time, role, pressure, share, corresponds=True):

@@ -8,7 +8,7 @@ import pytest
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
 from mvest.valve.anatomy.dimensions import ChordLayout
-from mvest.valve.anatomy.template import MARGINAL_S, Template
+from mvest.valve.anatomy.template import BRANCHING, MARGINAL_S, Template
 from mvest.valve.anatomy.valve import band_grid
 from tests.cases.folders import band_of, template_case
 from tests.cases.test_folder import assert_equal
@@ -80,6 +80,38 @@ def test_rest_lengths_follow_the_closed_frame_but_never_fall_below_the_open_one(
     assert (expected > 1.1 * open_length).tolist() == [False, True, False, True]
     np.testing.assert_allclose(chordae.rest_length, expected, rtol=1e-12)
     assert [chordae.family_names[k] for k in chordae.family] == ["marginal", "basal"] * 2
+
+
+def test_fans_branch_on_the_way_from_the_tip_to_their_middle():
+    band = LeafletBand.of(*cylinder(), anterior=1)
+    layout = ChordLayout(
+        marginal=(180.0 / 14 * 3,), branches=2, fan_width=180.0 / 7, basal=((-90.0, 0.5),),
+        strut=(), open_slack=1.1, marginal_slack=0.9, basal_slack=2.0, stiffness=(40.0, 16.0, 1.0),
+    )  # fmt: skip
+    tips = np.array([[20.0, 0.0, -30.0], [-20.0, 0.0, -30.0]])
+    closed, lower = band.vertices * [0.5, 0.5, 1.0], np.array([0.0, 0.0, 5.0])
+    chordae = lay_out_chordae(band, tips, closed, tips - lower, layout)
+    # phi = 2/14 and 4/14 of 180 between 160 and 20 degrees: angles 140, 120 and -90; mirrored.
+    angles, depth = (140, 120, -90, 40, 60, -90), (MARGINAL_S, MARGINAL_S, 0.5) * 2
+    places = np.array([at_angle(*place) for place in zip(angles, depth, strict=True)])
+    np.testing.assert_allclose(chordae.insertion, places, atol=1e-9)
+    assert chordae.parent.tolist() == [0, 0, -1, 1, 1, -1, -1, -1]
+    np.testing.assert_array_equal(chordae.tip[[0, 1, 3, 4, 6, 7]], [1, 1, 0, 0, 1, 0])
+    lengths = []
+    for leaflet, tip in ((places, tips), (places * [0.5, 0.5, 1.0], tips - lower)):
+        forks = leaflet.reshape(2, 3, 3)[:, :2].mean(axis=1)
+        forks = tip[[1, 0]] + BRANCHING * (forks - tip[[1, 0]])
+        own = replace(chordae, insertion=leaflet, junction=forks)
+        lengths.append(np.linalg.norm(np.diff(own.ends(tip), axis=1)[:, 0], axis=1))
+        if tip is tips:
+            np.testing.assert_allclose(chordae.junction, forks, atol=1e-9)
+    # The open frame needs longer trees than 0.9 of the closed one: on one way of each exactly so.
+    ratio = chordae.rest_length / lengths[1]
+    np.testing.assert_allclose(ratio[[0, 1, 3, 4]], ratio[[6, 6, 7, 7]], rtol=1e-12)
+    assert ratio[[6, 7]].min() > 0.9
+    over_open = (chordae.along(chordae.rest_length) / chordae.along(lengths[0]))[[0, 1, 3, 4]]
+    assert over_open.reshape(2, 2).min(axis=1) == pytest.approx([1.1, 1.1], rel=1e-12)
+    assert chordae.axial_stiffness.tolist() == [20, 20, 16, 20, 20, 16, 40, 40]
 
 
 @pytest.fixture

@@ -58,11 +58,11 @@ def test_rows_of_branching_chordae_may_have_any_order_and_names(tmp_path):
     folder = write_case(tmp_path / "case", case)
     file = folder / "chordae.csv"
     head, *rows = file.read_text().splitlines()
-    names = dict(zip(("b0", "b1", "b2"), ("trunk of A2", "left", "right"), strict=True))
+    names = {f"b{k}": f"fan {k}" for k in range(len(case.chordae.junction))}
     turned = [",".join(names.get(cell, cell) for cell in row.split(",")) for row in rows[::-1]]
     file.write_text("\n".join([head, *turned]))
     back, c = read_case(folder).chordae, len(case.chordae.insertion)
-    order = np.r_[np.arange(c)[::-1], c + np.arange(3)[::-1]]
+    order = np.r_[np.arange(c)[::-1], c + np.arange(len(names))[::-1]]
     np.testing.assert_array_equal(back.rest_length, case.chordae.rest_length[order])
     tips = case.frames[0].papillary_tips
     np.testing.assert_array_equal(back.ends(tips), case.chordae.ends(tips)[order])

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mvest.cases.tissue import FAMILIES
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.dimensions import FAMILIES
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Chordae, paths
 

@@ -16,7 +16,12 @@ from mvest.cases.tissue import SEEN_CLOSURE
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
-from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.template import (
+    BRANCHING,
+    INDENTATION_ANGLE,
+    INDENTATION_WIDTH,
+    Template,
+)
 from mvest.valve.geometry.proximity import closest_points
 from tests.cases.folders import closing
 from tests.cases.test_folder import assert_equal
@@ -49,20 +54,28 @@ def test_the_case_is_that_of_the_frames_and_passes_the_checks_of_a_folder(tmp_pa
     ]
     assert all(frame.corresponds for frame in case.frames)
     assert case.chordae_follow
-    assert len(case.chordae) == 34
+    chordae = case.chordae
+    assert len(chordae) == len(Template().chordae())
     # Where the template has them: the layout's phi and s are its own. Flat triangles of 6 mm lie
-    # up to 0.3 mm off the curved leaflet.
-    gap = np.linalg.norm(case.chordae.insertion - Template().chordae().insertion, axis=1)
-    assert gap.max() < 0.3
+    # up to 0.3 mm off the curved leaflet, and 1 mm where one spans an indentation.
+    gap = np.linalg.norm(chordae.insertion - Template().chordae().insertion, axis=1)
+    phi = np.mod(Template().chord_places().phi, 360.0)
+    plain = np.abs(np.abs(phi - 270.0) - INDENTATION_ANGLE) > INDENTATION_WIDTH
+    assert gap[plain].max() < 0.3
+    assert gap.max() < 1.0
     # By the closed frame, as one that was seen.
     here, there = (f.vertices for f in (case.frames[0], case.frames[1]))
-    place = closest_points(case.chordae.insertion, here, case.surface.triangles)
+    place = closest_points(chordae.insertion, here, case.surface.triangles)
     ends = place.interpolate(there, case.surface.triangles)
-    spans = np.linalg.norm(ends - case.frames[1].papillary_tips[case.chordae.tip], axis=1)
-    slack = np.array([SEEN_CLOSURE.marginal_slack, SEEN_CLOSURE.basal_slack])[case.chordae.family]
-    by_closed = case.chordae.rest_length / spans < 1.0001 * slack
-    assert by_closed.sum() >= 6
-    np.testing.assert_allclose((case.chordae.rest_length / spans)[by_closed], slack[by_closed])
+    c, tips = len(ends), case.frames[1].papillary_tips
+    fans = [ends[chordae.parent[:c] == k].mean(axis=0) for k in range(len(chordae.junction))]
+    own = tips[chordae.tip[c:]]
+    closed = replace(chordae, insertion=ends, junction=own + BRANCHING * (np.array(fans) - own))
+    spans = np.linalg.norm(np.diff(closed.ends(tips), axis=1)[:, 0], axis=1)
+    slack = np.where(chordae.family == 0, SEEN_CLOSURE.marginal_slack, SEEN_CLOSURE.basal_slack)
+    by_closed = chordae.rest_length / spans < 1.0001 * slack
+    assert by_closed.sum() >= 20
+    np.testing.assert_allclose((chordae.rest_length / spans)[by_closed], slack[by_closed])
     np.testing.assert_array_equal(case.uncertainty.std_mm, sequence().std_mm)
     assert_equal(read_case(write_case(tmp_path / "case", case)), case, "sha256", "derived")
     # What was seen last may be the open valve.
@@ -75,8 +88,11 @@ def test_thickness_and_fibres_vary_as_in_the_template():
     case, valve = case_of_sequence(sequence(TURN), FRAMES, TEXTS), Template().valve(32, 9)
     np.testing.assert_allclose(case.surface.thickness, valve.surface.thickness, rtol=1e-12)
     along = np.abs(np.sum(case.surface.fibre @ TURN * valve.surface.fibre, axis=1))
-    # Directions follow from the vertices alone; at the commissures the surface bends sharply.
-    away = np.abs(np.sin(np.deg2rad(LAYOUT.phi))) > 0.3
+    # Directions follow from the vertices alone; within two cells of the commissures the surface
+    # bends sharply, and at the indentations the free edge turns.
+    cell = 360.0 / LAYOUT.columns
+    away = np.abs((LAYOUT.phi + 90.0) % 180.0 - 90.0) > 2 * cell
+    away &= np.abs(np.abs(LAYOUT.phi - 270.0) - INDENTATION_ANGLE) > INDENTATION_WIDTH + cell
     assert along[away].min() > 0.97
     assert np.median(along) > 0.995
     thicker = case_of_sequence(

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 from mvest.errors import GeometryError, InputError
+from mvest.exchange.importing.chord_lines import MARGINAL_MM
 from mvest.exchange.importing.joining import _flat_part
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.simulation.arrival import POSE, SHIFT, ArrivalSettings, arrive
@@ -232,22 +233,27 @@ def test_branching_chords_of_a_fem_export(fem):
     true_tips = in_lps(TREES.frames[0].papillary_tips)
     assert tips == pytest.approx(true_tips[::-1], abs=1e-3)
     c, ends = len(truth.insertion), truth.ends(TREES.frames[0].papillary_tips)
-    assert (len(own.insertion), len(own.junction)) == (c, 3)
+    j = len(truth.junction)
+    assert (len(own.insertion), len(own.junction)) == (c, j)
     # Each segment is the true one with the same ends, and as long as drawn.
     away, number = cKDTree(in_lps(ends).reshape(-1, 6)).query(own.ends(tips).reshape(-1, 6))
     assert away.max() < 1e-3
-    assert sorted(number) == list(range(c + 3))
+    assert sorted(number) == list(range(c + j))
     length = np.linalg.norm(np.diff(ends, axis=1)[:, 0], axis=1)
     assert own.rest_length == pytest.approx(length[number], abs=1e-4)
-    true_family = np.where(number < c, truth.family[number], 0)
-    assert np.mean(own.family == true_family) > 0.95
+    # By the distance from the free edge, which the shift to the midsurface moves a little.
+    edge = cKDTree(TREES.surface.vertices[TREES.free_edge])
+    inwards = edge.query(truth.insertion[number[:c]])[0]
+    clear = np.abs(inwards - MARGINAL_MM) > 0.5
+    assert (own.family[:c] == (inwards > MARGINAL_MM))[clear].all()
+    assert clear.sum() > 40
     # A trunk is as stiff as its branches, and all trunks as the template's.
-    for junction in range(3):
+    for junction in range(j):
         branches = own.axial_stiffness[own.parent == junction].sum()
         assert own.axial_stiffness[c + junction] == pytest.approx(branches)
-    total = TRUTH.chordae.axial_stiffness.sum()
+    total = TRUTH.chordae.axial_stiffness[TRUTH.chordae.parent < 0].sum()
     assert own.axial_stiffness[own.parent < 0].sum() == pytest.approx(total)
-    assert any(f"chordae: {c} leaflet ends and 3 branching points" in s for s in found.derived)
+    assert any(f"chordae: {c} leaflet ends and {j} branching points" in s for s in found.derived)
 
 
 def test_chords_that_start_elsewhere_or_meet_are_refused(fem):
@@ -256,13 +262,16 @@ def test_chords_that_start_elsewhere_or_meet_are_refused(fem):
     refused(fem, "chords begin up to 5.0 mm from the papillary tips", options=moved)
     file, ends = fem / "Chords_mesh_-_Region_0.vtk", TREES.chordae.junction[[0, 2]]
     write_lines(in_lps(np.stack([ends, TREES.chordae.junction[[1, 1]]], axis=1)), file)
-    refused(fem, "2 chords meet at .*, where others begin; expected one", options=OPTIONS)
-    for file in fem.glob("Chords*"):
-        model = pyvista.read(file)
-        write_lines(model.points.reshape(-1, 2, 3)[:, ::-1], file)
-    refused(
-        fem, r"chords begin up to \d\d\.\d mm", options=SlicerheartOptions(tips=tuple(tips.ravel()))
+    refused(fem, r"\d chords meet at .*, where others begin; expected one", options=OPTIONS)
+    for one in fem.glob("Chords*"):
+        one.unlink()
+    ends = TREES.chordae.insertion
+    upwards = np.stack(
+        [ends, np.broadcast_to(TREES.frames[0].papillary_tips[0], ends.shape)], axis=1
     )
+    write_lines(in_lps(upwards), file)
+    given = SlicerheartOptions(tips=tuple(tips.ravel()))
+    refused(fem, r"chords begin up to \d\d\.\d mm", options=given)
 
 
 def test_a_mirrored_valve_is_refused_unless_accepted(folder, case):

@@ -11,6 +11,7 @@ import numpy as np
 
 from mvest.estimation.estimate import InnovationSummary
 from mvest.estimation.information.identifiability import TradeOff
+from mvest.problem.fields import chord_fields
 from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
 from mvest.valve.anatomy.template import Template
 
@@ -47,7 +48,7 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
     )
     observed = truth + rng.normal(0.0, 0.4, truth.shape)
     observed[:, :4] = np.nan  # a corner that was not seen
-    x, places = valve.surface.vertices, valve.chordae.insertion
+    x = valve.surface.vertices
     return {
         "triangles": valve.surface.triangles,
         "region": valve.surface.region,
@@ -64,8 +65,7 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
         "distance_generic": np.linalg.norm(generic - observed, axis=2),
         "distance_fitted": np.linalg.norm(fitted - observed, axis=2),
         "tips": np.repeat(valve.papillary_tips[None], 3, axis=0),
-        "chord_tip": valve.chordae.tip,
-        "chord_insertion": np.linalg.norm(x[:, None] - places, axis=2).argmin(axis=0),
+        **chord_fields(valve.chordae, x),
     }
 
 
