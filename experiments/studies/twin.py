@@ -85,10 +85,7 @@ def run_twin(job: Job[Settings]) -> Result:
 
 
 def _measured(twin: Twin) -> dict[str, float]:
-    """Tenting, median strains from the open valve, and stress of the closed truth, by leaflet.
-
-    Empty if it does not close.
-    """
+    """Tenting, strains from the open valve, and stress of the truth; empty if it stays open."""
     model = twin.truth_model
     model.continuation = True  # the observation is made from this closed state
     closed = model.close(twin.truth_values, sensitivities=False)
@@ -102,8 +99,9 @@ def _measured(twin: Twin) -> dict[str, float]:
     for k, name in enumerate(surface.region_names):
         own = surface.region == k
         for direction, values in zip(("along", "across"), 100 * strain[own].T, strict=True):
-            row[f"strain {direction}, {name}"] = weighted_quantiles(values, weight[own], [0.5])[0]
-        row[f"stress, {name}"] = found[f"stress_p99_{name}_mpa"]
+            (median,) = weighted_quantiles(values, weight[own], [0.5])
+            row[f"median strain {direction}, {name}"] = median
+        row[f"99 % stress, {name}"] = found[f"stress_p99_{name}_mpa"]
     return row
 
 
@@ -194,10 +192,8 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
         "tenting": Column("mm"),
     }
     for name in rows[-1]:
-        if name.startswith(("strain ", "stress, ")):
-            kind, _, leaflet = name.partition(", ")
-            label = f"99 % {kind}, {leaflet}" if kind == "stress" else f"median {name}"
-            about[name] = Column("MPa" if kind == "stress" else "%", label=label)
+        if name.startswith(("median strain", "99 % stress")):
+            about[name] = Column("MPa" if "stress" in name else "%")
     return table(rows, **about)
 
 

@@ -329,3 +329,5 @@ class MechanicsSettings:
         require_numbers(self, "mechanics", "density", "support_stiffness", "patch_radius")
         if self.support not in ("hinge", "clamp"):
             raise InputError(f"annulus support {self.support!r}, expected hinge or clamp")
+        if self.relaxation and any(own.law == "corotational" for own in self.tissue.values()):
+            raise InputError("relaxation of mechanics: the corotational law has none")

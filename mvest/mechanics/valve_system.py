@@ -191,9 +191,8 @@ def material_law(
     ratio = np.array([tissue.prestretch_ratio for tissue in tissues])
     if not np.all(prestretch > 0.0):
         raise InputError(f"prestretch of tissue = {prestretch.tolist()}, expected > 0")
-    stretched = np.any([prestretch, ratio] != np.ones(1)) or any(
-        name.startswith("prestretch.") for name in values
-    )
+    stretched = any(name.startswith("prestretch.") for name in values)
+    stretched |= bool(np.any(prestretch != 1.0) or np.any(ratio != 1.0))
     if variation is None and not stretched and relaxed is None and len(laws) == 1:
         return laws[0]
     scale = 1.0 if variation is None else variation.scale(values)

@@ -136,6 +136,9 @@ def test_a_valve_from_its_shape_about_to_open():
     assert failed.reason.startswith("relaxation: the valve does not close: Newton's method")
     with pytest.raises(InputError, match="pressure_mmHg = -1, expected > 0"):
         Relaxation({}, -1)
+    rotated = {name: replace(own, law="corotational") for name, own in TISSUE.items()}
+    with pytest.raises(InputError, match="relaxation of mechanics: the corotational law has none"):
+        replace(model.settings, tissue=rotated)
 
 
 def test_a_moving_valve_has_no_derivative_by_its_prestretch():
