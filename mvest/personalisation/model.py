@@ -114,7 +114,7 @@ def build_coarse(
 
 def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
     if mesh.source != "tetwild":
-        leaflets, columns = len(shape.band.sections), mesh.columns
+        leaflets, columns = len(shape.sections), mesh.columns
         if mesh.source == "automatic":
             columns = leaflets * -(-columns // leaflets)
         return shape.layers("hex18", columns, mesh.rows)

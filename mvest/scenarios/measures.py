@@ -77,7 +77,8 @@ def measure_steps(
         iterations = sum(len(r.residuals) - 1 for r in simulation.records if r.time <= time + 1e-12)
         length = np.nan
         if len(leaflets) == 2:
-            length = coaptation_length(middle, *leaflets, plane, contact_distance)
+            one, other = leaflets
+            length = coaptation_length(middle, one, other, plane, contact_distance)
         measures.append(
             {
                 "time": float(time),
@@ -147,7 +148,8 @@ def measure_closed(model: ClosureModel, system: System, x: FloatArray) -> Measur
         "coaptation_area_mm2": area,
     }
     if len(leaflets) == 2:
-        measures["coaptation_length_mm"] = coaptation_length(vertices, *leaflets, plane, reach)
+        one, other = leaflets
+        measures["coaptation_length_mm"] = coaptation_length(vertices, one, other, plane, reach)
         measures["coaptation_height_mm"] = area / size.commissural_diameter
     measures |= tenting(vertices, surface.triangles, annulus, plane)
     measures["ap_diameter_mm"] = size.anteroposterior_diameter

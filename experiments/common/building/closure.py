@@ -19,7 +19,7 @@ from mvest.quantities import Share
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
-from mvest.valve.anatomy.valve import MaterialSurface, Motion, Valve
+from mvest.valve.anatomy.valve import Motion, Valve, band_grid
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
 
@@ -133,11 +133,6 @@ def upright(valve: Valve) -> Valve:
     )
 
 
-def _shape(anatomy: Anatomy) -> MaterialSurface:
-    """The anatomy in material coordinates."""
-    return anatomy if isinstance(anatomy, Template) else anatomy.band
-
-
 def guide_of(model: ClosureModel, anatomy: Anatomy, mesh: Values) -> ClosureModel | None:
     """The model on a mesh of half as many cells each way, with its own guide; None at the coarsest.
 
@@ -147,9 +142,9 @@ def guide_of(model: ClosureModel, anatomy: Anatomy, mesh: Values) -> ClosureMode
         return None
     cells = COARSEST
     if mesh["columns"] > 2.5 * COARSEST[0]:
-        half = _varied(mesh, 0.5, len(_shape(anatomy).sections))
+        half = _varied(mesh, 0.5, len(anatomy.sections))
         cells = (half["columns"], max(mesh["rows"] // 2, COARSEST[1]))
-    coarse = replace(model, mesh=structured_mesh(_shape(anatomy), "hex18", *cells), guide=None)
+    coarse = replace(model, mesh=structured_mesh(anatomy, "hex18", *cells), guide=None)
     coarse.guide = guide_of(coarse, anatomy, {"columns": cells[0], "rows": cells[1]})
     return coarse
 
@@ -171,7 +166,7 @@ def build_mesh(anatomy: Anatomy, mesh: Values, element: str, store: Path) -> Sol
         surface, normals = anatomy.given.surface, None
     else:
         surface = anatomy.valve(*UNSTRUCTURED_SURFACE).surface
-        normals = anatomy.normals(*UNSTRUCTURED_SURFACE)
+        normals = anatomy.normal(*band_grid(*UNSTRUCTURED_SURFACE)[:2])
     return tetrahedral_leaflets(surface, mesh["edge_length"], element, store, normals)
 
 
@@ -182,7 +177,7 @@ def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureMod
     """
     anatomy, settings = anatomy_of(config), mechanics_of(config)
     observed, points = config["observation"], config["mechanics"]["contact_points"]
-    leaflets = len(_shape(anatomy).sections)
+    leaflets = len(anatomy.sections)
     mesh = dict(config["mesh"]) | _varied(config["mesh"], variation.mesh, leaflets)
     model = ClosureModel(
         anatomy.valve(observed["columns"], observed["rows"]),

@@ -31,6 +31,7 @@ from mvest.reporting.tables import Table, table
 from mvest.scenarios.measures import contact_pressure, measure_steps
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.valve import band_grid
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.solid_mesh import embed
 
@@ -200,8 +201,8 @@ def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
     with SolveBar(name, len(model.settings.protocol.steps()), 1) as bar:
         model.on_step = bar.step
         result = model.close(truth_of(values), sensitivities=False, every_frame=True)
-    seen = values["observation"]
-    return Closing(model, result, anatomy_of(values).normals(seen["columns"], seen["rows"]))
+    grid = band_grid(values["observation"]["columns"], values["observation"]["rows"])
+    return Closing(model, result, anatomy_of(values).normal(grid.phi, grid.s))
 
 
 def draw_closing(part: Any, path: Path, steps: Mapping[int, str]) -> None:

@@ -56,7 +56,7 @@ class Band:
 
     def __init__(self, valve: Valve) -> None:
         surface = valve.surface
-        self.valve = valve
+        self.given = valve
         self.region_names = surface.region_names
         self._coordinates: SurfaceCoordinates = surface_coordinates(
             surface.vertices, surface.triangles, valve.annulus, valve.free_edge
@@ -145,7 +145,7 @@ class Band:
         self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
     ) -> FloatArray:
         """Reference positions ``(k, 3)`` mm of material points; zeta is -1 on the atrial face."""
-        surface = self.valve.surface
+        surface = self.given.surface
         at = self.locate(phi, s)
         middle = _mean(at, surface, surface.vertices)
         zeta = np.broadcast_to(np.asarray(zeta, float), np.shape(phi))
@@ -159,7 +159,7 @@ class Band:
         return self._normal(self.locate(phi, s))
 
     def _normal(self, at: Located) -> FloatArray:
-        normal = _mean(at, self.valve.surface, self._normals)
+        normal = _mean(at, self.given.surface, self._normals)
         return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
 
     def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
@@ -168,7 +168,7 @@ class Band:
         begin, end = self._width * section, self._width * (section + 1)
         # The last section ends at 360 and not at 0.
         phi = np.where((end > 359.0) & (phi < begin - 0.5 * (360.0 - self._width)), 360.0, phi)
-        surface = self.valve.surface
+        surface = self.given.surface
         triangle, weights = self.locate(np.clip(phi, begin + INSIDE, end - INSIDE), s)
         corners = surface.fibre[surface.triangles[triangle]]
         # A vertex between leaflets has the fibre of one of them, and which one is unknown.
@@ -180,11 +180,11 @@ class Band:
 
     def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
         """Thickness ``(k,)`` mm."""
-        return self.displaced(phi, s, self.valve.surface.thickness)
+        return self.displaced(phi, s, self.given.surface.thickness)
 
     def displaced(self, phi: FloatArray, s: FloatArray, vertices: FloatArray) -> FloatArray:
         """Positions ``(k, 3)`` of material points while the surface's vertices are elsewhere."""
-        return _mean(self.locate(phi, s), self.valve.surface, vertices)
+        return _mean(self.locate(phi, s), self.given.surface, vertices)
 
     def annulus_positions(self, phi: FloatArray, annulus: FloatArray) -> FloatArray:
         """Positions ``(k, 3)`` of annulus points, given those of the valve's annulus vertices.
@@ -195,18 +195,18 @@ class Band:
         annulus : ndarray
             ``(a, 3)`` mm, of the vertices ``valve.annulus``.
         """
-        vertices = np.array(self.valve.surface.vertices)
-        vertices[self.valve.annulus] = annulus
+        vertices = np.array(self.given.surface.vertices)
+        vertices[self.given.annulus] = annulus
         return self.displaced(phi, np.zeros(len(phi)), vertices)
 
-    def sampled(self, columns: int, rows: int) -> Valve:
-        """The same valve, chordae and motion on a grid of ``columns x rows`` vertices."""
-        valve, motion = self.valve, self.valve.motion
+    def valve(self, columns: int, rows: int) -> Valve:
+        """The valve, its chordae and motion on a grid of ``columns x rows`` vertices."""
+        given, motion = self.given, self.given.motion
 
         def attached(phi: FloatArray) -> tuple[FloatArray, Chordae, Motion]:
             annulus = np.stack([self.annulus_positions(phi, frame) for frame in motion.annulus])
             moved = Motion(motion.phase, annulus, motion.papillary_tips)
-            return valve.papillary_tips, valve.chordae, moved
+            return given.papillary_tips, given.chordae, moved
 
         return sampled_valve(self, columns, rows, attached)
 

@@ -21,7 +21,7 @@ import numpy as np
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import FAMILIES, ChordLayout, TemplateParameters
-from mvest.valve.anatomy.valve import Chordae, Motion, Valve, band_grid, sampled_valve
+from mvest.valve.anatomy.valve import Chordae, Motion, Valve, sampled_valve
 
 ANTERIOR, POSTERIOR = 0, 1
 REGIONS = ("anterior", "posterior")
@@ -247,11 +247,6 @@ class Template:
             n = np.cross(r, t)
             total += weight * n / np.linalg.norm(n, axis=-1, keepdims=True)
         return total / np.linalg.norm(total, axis=-1, keepdims=True)
-
-    def normals(self, columns: int, rows: int) -> FloatArray:
-        """Directions ``(n, 3)`` of the thickness at the vertices of `valve`."""
-        grid = band_grid(columns, rows)
-        return self.normal(grid.phi, grid.s)
 
     def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
         """Unit fibre directions ``(k, 3)`` as seen from the leaflet ``region``."""

@@ -7,7 +7,6 @@ nearness: regions and fibres from the midsurface, pressure faces from the closed
 
 from __future__ import annotations
 
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from mvest.errors import GeometryError, InputError, MeshingError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.band import Band
-from mvest.valve.anatomy.valve import LeafletSurface, Valve, band_grid
+from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.thickening import FACE_KINDS, ClosedSurface, thicken
 from mvest.valve.geometry.triangles import area_vectors, areas, mean_fibre
@@ -25,25 +24,8 @@ from mvest.valve.mesh.structured import structured_mesh
 from mvest.valve.mesh.tetwild import tetrahedralize
 
 
-class GivenValve:
+class GivenValve(Band):
     """An imported valve in any resolution, and its meshes in layers."""
-
-    def __init__(self, given: Valve) -> None:
-        self.given = given
-
-    @cached_property
-    def band(self) -> Band:
-        """Material coordinates; GeometryError if the leaflets do not meet along lines."""
-        return Band(self.given)
-
-    def valve(self, columns: int, rows: int) -> Valve:
-        """The valve on ``columns x rows`` vertices."""
-        return self.band.sampled(columns, rows)
-
-    def normals(self, columns: int, rows: int) -> FloatArray:
-        """Directions ``(n, 3)`` of the thickness at the vertices of `valve`."""
-        grid = band_grid(columns, rows)
-        return self.band.normal(grid.phi, grid.s)
 
     def layers(self, element: str, columns: int, rows: int, layers: int = 1) -> SolidMesh:
         """A mesh of ``columns x rows x layers`` cells.
@@ -54,7 +36,7 @@ class GivenValve:
             If cells are folded.
         """
         try:
-            return structured_mesh(self.band, element, columns, rows, layers)
+            return structured_mesh(self, element, columns, rows, layers)
         except GeometryError as fault:
             raise GeometryError(
                 f"structured mesh of {columns} x {rows} cells: {fault}; the reference "

@@ -138,7 +138,7 @@ def test_names_in_any_order_are_those_of_the_same_leaflets(three, order):
     surface = three.surface
     names = tuple(surface.region_names[k] for k in order)
     band = Band(relabelled(three, np.argsort(order)[surface.region], names))
-    sampled, mesh = band.sampled(60, 25).surface, structured_mesh(band, "hex18", 24, 3)
+    sampled, mesh = band.valve(60, 25).surface, structured_mesh(band, "hex18", 24, 3)
     assert sampled.region_names == mesh.region_names == names
     for number, name in enumerate(names):
         own, same = (
