@@ -4,7 +4,9 @@
 stand beside the ranges of ``physiology.toml`` and are marked if they are outside. The ranges are
 those of normal mitral valves; a valve with other leaflets than two has none.
 
-The belly of a leaflet is what touches no leaflet that faces it, within the reach of the contact.
+The belly of a leaflet is what touches no leaflet that faces it, within the reach of the contact,
+and lies farther than `COMMISSURE_MM` from the line between the leaflets in the open valve: the
+commissural leaflets are no belly.
 Strain is that from the open to the closed shape of the midsurface, as in animals with markers. The
 tenting height is the depth of the coaptation point below the annulus plane, the tenting area that
 below the line between the hinges of both leaflets.
@@ -22,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mvest.closure.model import ClosureModel
 from mvest.closure.stress import peak_stress
@@ -37,7 +40,7 @@ from mvest.mechanics.system import Loads, System
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.valve import Valve
-from mvest.valve.geometry.triangles import areas
+from mvest.valve.geometry.triangles import areas, edges_between
 from mvest.valve.measure.clinical import clinical_measurements, plane_of_leaflets
 from mvest.valve.measure.coaptation import (
     coaptation_depth,
@@ -53,6 +56,8 @@ QUANTITIES: dict[str, dict[str, Any]] = tomllib.loads(
 """The quantities of ``physiology.toml``."""
 
 PIXEL_MM = 0.2
+COMMISSURE_MM = 5.0
+"""Reach of the commissural leaflets from the line between the leaflets [choice]."""
 
 Values: TypeAlias = dict[tuple[str, str], float | list[float]]
 """Quantity and part of the valve -> value, or median and quantiles at 5 and 95 % of the area."""
@@ -156,6 +161,10 @@ def _strains(valve: Valve, shape: FloatArray, reach: float) -> Values:
     strain = 100.0 * triangle_strains(surface.vertices, shape, surface)
     size = areas(surface.vertices, surface.triangles)
     free = ~touching_triangles(shape, surface.triangles, reach)
+    between = surface.vertices[edges_between(surface.triangles, surface.region).ravel()]
+    if len(between):
+        middles = surface.vertices[surface.triangles].mean(axis=1)
+        free &= cKDTree(between).query(middles)[0] > COMMISSURE_MM
     for number, name in enumerate(surface.region_names):
         leaflet = surface.region == number
         belly = leaflet & free
