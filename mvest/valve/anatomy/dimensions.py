@@ -21,13 +21,15 @@ class AnnulusDimensions:
     """The annulus: an ellipse with a flatter anterior half, bent to a saddle.
 
     Sources. Diameters of normal annuli by three-dimensional echocardiography: 24 ± 3 to 29 ± 3 and
-    30.8 ± 4.4 mm anteroposterior, 35 ± 5 to 39 ± 4 mm commissural; height 5.9 to 6.8 mm, and 0.15
-    to 0.25 of the commissural diameter (Salgo et al. 2002, Circulation 106:711) [recalled]. The
-    open frame is the last one before closure, so that most of the contraction lies behind it.
+    30.8 ± 4.4 mm anteroposterior, 35 ± 5 to 39 ± 4 mm commissural, height 5.9 to 6.8 ± 1 mm
+    (PMC7368231, table 3). A higher saddle puts the bellies of closed leaflets under more tension
+    (Salgo et al. 2002, Circulation 106:711); the height is the largest within two standard
+    deviations. The open frame is the last one before closure: most of the contraction lies behind
+    it.
     """
 
     commissural_diameter: Length = 36.0
-    anteroposterior_diameter: Length = 24.8
+    anteroposterior_diameter: Length = 23.0
     saddle_height: Place = 7.9  #: extent along the valve's axis
     commissure_angle: Angle = 18.0  #: parametric angle of the commissures above the x axis
     #: relative shortening of the annulus until the valve is closed
@@ -55,8 +57,8 @@ class LeafletPair:
     Thickness is that of the paper.
     """
 
-    anterior: LeafletDimensions = LeafletDimensions(23.8, 1.32, 0.11)
-    posterior: LeafletDimensions = LeafletDimensions(13.8, 1.26, 0.07)
+    anterior: LeafletDimensions = LeafletDimensions(24.1, 1.32, 0.11)
+    posterior: LeafletDimensions = LeafletDimensions(13.9, 1.26, 0.07)
     commissural_length: Length = 9.0  #: from annulus to free edge at the commissures
     indentation: Share = 0.2  #: of the length
     scallop_bulge: Share = 0.09  #: depth of a scallop's bulge over its length
@@ -78,9 +80,9 @@ class FreeEdge:
     commissural_y: Place = 1.4  #: y of the commissures
     #: distance of the middle of the open edge from there along y, towards its own annulus
     anterior_opening: Place = 1.0
-    posterior_opening: Place = 5.4
-    sag: Place = 9.5
-    depth: Place = 6.0
+    posterior_opening: Place = 4.8
+    sag: Place = 8.8
+    depth: Place = 8.2
     drop: Place = 2.0
 
 
@@ -89,7 +91,7 @@ class PapillaryPlace:
     """Positions of the papillary tips."""
 
     #: (x, y, z), the tip at positive x; the other one is its mirror image
-    tip: tuple[Place, Place, Place] = (17.7, 3.0, -25.0)
+    tip: tuple[Place, Place, Place] = (17.7, 4.0, -25.0)
     #: (x, y, z), displacement of this tip after the chordae got their lengths; the other tip moves
     #: as its mirror image. The chordae tether the leaflets then, but are never taut in the open
     #: valve.
