@@ -37,26 +37,18 @@ class CycleProtocol:
 
     Pressure, annulus and papillary tips follow one phase: a smooth rise from the open valve's 0 to
     the closed valve's 1, a plateau, and a smooth fall.
-
-    Attributes
-    ----------
-    pressure_mmHg : float
-        Transmitral, on the plateau.
-    rise, hold, fall : float
-        s, durations of the three parts.
-    dt : float
-        s, largest time step; the time between two frames is divided evenly. Leaflets flip within a
-        few milliseconds. If a step is longer, frames jump as parameters change (measured by
-        `experiment=cycle`).
-    times : tuple of float
-        s, times of the observed frames, strictly increasing from >= 0; the run ends at the last.
     """
 
-    pressure_mmHg: Pressure = 120.0
+    pressure_mmHg: Pressure = 120.0  #: transmitral, on the plateau
+    #: s, durations of the three parts
     rise: BeatTime = 0.3
     hold: BeatTime = 0.2
     fall: BeatTime = 0.3
+    #: s, largest time step; the time between two frames is divided evenly. Leaflets flip within a
+    #: few milliseconds. If a step is longer, frames jump as parameters change (measured by
+    #: `experiment=cycle`).
     dt: TimeStep = 0.00625
+    #: s, times of the observed frames, strictly increasing from >= 0; the run ends at the last
     times: tuple[BeatTime, ...] = field(default=DEFAULT_TIMES)
 
     def __post_init__(self) -> None:

@@ -78,18 +78,10 @@ GATE_CASES = (
 
 @dataclass(frozen=True, slots=True)
 class GateRow:
-    """Outcome of one case.
-
-    Attributes
-    ----------
-    case : str
-    mean_mm, max_mm : float
-        Distance between this closed surface and the reference's; NaN if the closure failed.
-    passed : bool
-    reason : str
-    """
+    """Outcome of one case."""
 
     case: str
+    #: distance between this closed surface and the reference's; NaN if the closure failed
     mean_mm: float
     max_mm: float
     passed: bool

@@ -42,18 +42,13 @@ SEEN = 1e-5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledPosterior:
-    """Covariance of an estimate, and the samples' part of it.
+    """Covariance of an estimate, and the samples' part of it."""
 
-    Attributes
-    ----------
-    covariance, from_samples : (p, p)
-    moved : (p, K)
-        Shift of the estimate by each sample, with a gain computed without it; scaled so that
-        ``moved @ moved.T`` is ``from_samples``.
-    """
-
+    #: (p, p)
     covariance: FloatArray
     from_samples: FloatArray
+    #: (p, K), shift of the estimate by each sample, with a gain computed without it; scaled so that
+    #: ``moved @ moved.T`` is ``from_samples``
     moved: FloatArray
 
 

@@ -41,37 +41,21 @@ NAME_THEM = "name them anterior and posterior (also in place of AML, PML or Ante
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A triangulated surface with the data of its file.
+    """A triangulated surface with the data of its file."""
 
-    Attributes
-    ----------
-    vertices
-        ``(n, 3)`` in the unit of the file; finite.
-    triangles
-        ``(m, 3)``; polygons are split.
-    point_data, cell_data
-        Named arrays with n or m rows.
-    groups
-        Object name of each triangle (GLB); empty if there are none.
-    region
-        ``(m,)`` index into the case's regions; None without labels.
-    others
-        Number of cells of each other type, by VTK name ("tetra", "wedge"); single vertices are
-        not counted.
-    lines
-        ``(k, 2)`` ends of the line segments of the file.
-    space
-        "LPS" or "RAS" if 3D Slicer named the axes in a title, comment or field data; else None.
-    """
-
-    vertices: FloatArray
-    triangles: IntArray
+    vertices: FloatArray  #: ``(n, 3)`` in the unit of the file; finite
+    triangles: IntArray  #: ``(m, 3)``; polygons are split
+    #: named arrays with n or m rows
     point_data: Data = field(default_factory=dict)
     cell_data: Data = field(default_factory=dict)
-    groups: Sequence[str] = ()
-    region: IntArray | None = None
+    groups: Sequence[str] = ()  #: object name of each triangle (GLB); empty if there are none
+    region: IntArray | None = None  #: ``(m,)`` index into the case's regions; None without labels
+    #: number of cells of each other type, by VTK name ("tetra", "wedge"); single vertices are not
+    #: counted
     others: Mapping[str, int] = field(default_factory=dict)
+    #: "LPS" or "RAS" if 3D Slicer named the axes in a title, comment or field data; else None
     space: str | None = None
+    #: ``(k, 2)`` ends of the line segments of the file
     lines: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
 

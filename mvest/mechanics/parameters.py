@@ -25,26 +25,15 @@ class NamePart(Enum):
 
 
 class Kind(NamedTuple):
-    """One kind of parameter.
+    """One kind of parameter."""
 
-    Attributes
-    ----------
-    unit : str
-        Empty if dimensionless.
-    part : NamePart
-    low, high : float
-        Range that a configuration may use.
-    description : str
-    positive : bool
-        Whether it is positive, so that its logarithm is estimated.
-    """
-
-    unit: str
+    unit: str  #: empty if dimensionless
     part: NamePart
+    #: range that a configuration may use
     low: float
     high: float
     description: str
-    positive: bool = True
+    positive: bool = True  #: whether it is positive, so that its logarithm is estimated
 
     @property
     def whole(self) -> bool:

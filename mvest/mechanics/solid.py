@@ -53,24 +53,14 @@ LINEAR = 1e-7
 
 @dataclass(slots=True, eq=False)
 class SolidState:
-    """State of the solid at given nodal positions.
+    """State of the solid at given nodal positions."""
 
-    Attributes
-    ----------
-    green : (e, q, 6)
-        Green-Lagrange strain, enhanced part included.
-    stress, tangent : (e, q, 6) and (e, q, 6, 6) MPa
-    alpha : (e, n_modes)
-        Enhanced parameters.
-    deformation : (e, q, 3, 3)
-        F in the fibre frame.
-    """
-
-    green: FloatArray
+    green: FloatArray  #: (e, q, 6), Green-Lagrange strain, enhanced part included
+    #: (e, q, 6) and (e, q, 6, 6) MPa
     stress: FloatArray
     tangent: FloatArray
-    alpha: FloatArray
-    deformation: FloatArray
+    alpha: FloatArray  #: (e, n_modes), enhanced parameters
+    deformation: FloatArray  #: (e, q, 3, 3), F in the fibre frame
 
 
 class Solid:

@@ -120,16 +120,10 @@ def draw_candidate(
 # -- the valve on slices of the volume ------------------------------------------------------------
 @dataclass(frozen=True, slots=True, eq=False)
 class SlicePlane:
-    """A plane with its own axes.
+    """A plane with its own axes."""
 
-    Attributes
-    ----------
-    origin : (3,) mm
-    right, up : (3,)
-        Orthonormal.
-    """
-
-    origin: FloatArray
+    origin: FloatArray  #: (3,) mm
+    #: (3,), orthonormal
     right: FloatArray
     up: FloatArray
 

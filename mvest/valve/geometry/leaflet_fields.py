@@ -88,25 +88,16 @@ class LeafletFields:
 
 
 class ThickLeaflets(NamedTuple):
-    """The closed surface of two leaflets, cut apart where they are in contact.
+    """The closed surface of two leaflets, cut apart where they are in contact."""
 
-    Attributes
-    ----------
-    vertices, triangles
-        ``(n, 3)`` mm from the first point of the grid, and ``(m, 3)``.
-    seams : (2,) mm
-        Length from the annulus down over which the leaflets are one piece, on the side of each tip.
-    grown_mm : float
-        Outward offset of all walls needed to close holes.
-    derived : tuple of str
-        Changes needed to get one closed surface.
-    """
-
+    #: ``(n, 3)`` mm from the first point of the grid, and ``(m, 3)``
     vertices: FloatArray
     triangles: IntArray
+    #: (2,) mm, length from the annulus down over which the leaflets are one piece, on the side of
+    #: each tip
     seams: FloatArray
-    grown_mm: float
-    derived: tuple[str, ...]
+    grown_mm: float  #: outward offset of all walls needed to close holes
+    derived: tuple[str, ...]  #: changes needed to get one closed surface
 
 
 def fields_of_masks(

@@ -42,24 +42,15 @@ OUTSIDE = 0.01
 
 @dataclass(frozen=True, slots=True)
 class SurfaceCoordinates:
-    """Harmonic coordinates of a band and their circumferential direction.
+    """Harmonic coordinates of a band and their circumferential direction."""
 
-    Attributes
-    ----------
-    triangles : ndarray
-        ``(m, 3)`` vertex indices.
-    theta, s : (n,)
-        Angle around the valve in [0, 2 pi), and 0 (annulus) to 1 (free edge).
-    modulus : float
-        Length of the strip for a width of 2 pi: ``(theta, modulus * s)`` is nearly conformal.
-    circumferential : ndarray
-        ``(n, 3)`` unit tangents parallel to the annulus (perpendicular to the gradient of ``s``).
-    """
-
-    triangles: IntArray
+    triangles: IntArray  #: ``(m, 3)`` vertex indices
+    #: (n,), angle around the valve in [0, 2 pi), and 0 (annulus) to 1 (free edge)
     theta: FloatArray
     s: FloatArray
+    #: length of the strip for a width of 2 pi: ``(theta, modulus * s)`` is nearly conformal
     modulus: float
+    #: ``(n, 3)`` unit tangents parallel to the annulus (perpendicular to the gradient of ``s``)
     circumferential: FloatArray
 
     def strip_triangles(self) -> FloatArray:

@@ -14,17 +14,11 @@ from mvest.typing import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class AnnulusPlane:
-    """Best plane through an annulus, with the three clinical directions.
+    """Best plane through an annulus, with the three clinical directions."""
 
-    Attributes
-    ----------
-    origin : (3,) mm
-        Centroid of the annulus curve, weighted by length.
-    normal, anterior, lateral : (3,) unit
-        From atrium to ventricle; in the plane from posterior to anterior; ``normal × anterior``.
-    """
-
-    origin: FloatArray
+    origin: FloatArray  #: (3,) mm, centroid of the annulus curve, weighted by length
+    #: (3,) unit, from atrium to ventricle; in the plane from posterior to anterior; ``normal ×
+    #: anterior``
     normal: FloatArray
     anterior: FloatArray
     lateral: FloatArray

@@ -34,21 +34,14 @@ MAX_PIXELS = 50_000_000
 
 @dataclass(frozen=True, slots=True)
 class LeafletProjection:
-    """Leaflets seen from the atrium along the annulus normal, as an image.
+    """Leaflets seen from the atrium along the annulus normal, as an image."""
 
-    Attributes
-    ----------
-    anterior, lateral : (rows,) and (columns,) mm
-        Pixel centres along those directions.
-    inside : (rows, columns)
-        Pixels inside the projected annulus.
-    depth : (rows, columns) mm
-        Depth of the first leaflet surface below the annulus plane, infinite if there is none.
-    """
-
+    #: (rows,) and (columns,) mm, pixel centres along those directions
     anterior: FloatArray
     lateral: FloatArray
-    inside: BoolArray
+    inside: BoolArray  #: (rows, columns), pixels inside the projected annulus
+    #: (rows, columns) mm, depth of the first leaflet surface below the annulus plane, infinite if
+    #: there is none
     depth: FloatArray
 
 
@@ -329,26 +322,18 @@ def _part_centroids(n: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gap:
-    """The gap of a closed valve as an image, seen from the atrium along the annulus normal.
+    """The gap of a closed valve as an image, seen from the atrium along the annulus normal."""
 
-    Attributes
-    ----------
-    anterior, lateral : (rows,) and (columns,) mm
-        Pixel centres along those directions of the annulus.
-    open, slit : (rows, columns)
-        Pixels of the gap, and other pixels within the annulus that no midsurface covers.
-    level : (rows, columns) mm
-        Depth of the nearest midsurface below the annulus plane.
-    resolution : float
-        mm.
-    """
-
+    #: (rows,) and (columns,) mm, pixel centres along those directions of the annulus
     anterior: FloatArray
     lateral: FloatArray
+    #: (rows, columns), pixels of the gap, and other pixels within the annulus that no midsurface
+    #: covers
     open: BoolArray
     slit: BoolArray
+    #: (rows, columns) mm, depth of the nearest midsurface below the annulus plane
     level: FloatArray
-    resolution: float
+    resolution: float  #: mm
 
     @property
     def area(self) -> float:
