@@ -161,10 +161,7 @@ def source_key(*made_by: Any) -> str:
 def content_digest(*values: Any) -> str:
     """SHA-256 of the content of arrays, dataclasses, mappings, sequences, numbers and texts.
 
-    Raises
-    ------
-    InputError
-        If something is none of these.
+    InputError if something is none of these.
     """
     digest = hashlib.sha256()
     for value in values:

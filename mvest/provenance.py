@@ -98,10 +98,7 @@ def config_hash(config: Mapping[str, Any]) -> str:
 def write_json(path: Path, value: Any) -> None:
     """Write data as JSON, atomically; keys keep their order.
 
-    Raises
-    ------
-    InputError
-        The data have no JSON form, or the file cannot be written.
+    InputError if the data have no JSON form, or the file cannot be written.
     """
     text = json.dumps(_plain(value, "value"), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     write_atomically(path, text, sync=True)

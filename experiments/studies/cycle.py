@@ -77,10 +77,7 @@ along the path that tests frames for jumps."""
 def run_cycle(job: Job[Settings]) -> Result:
     """Simulate a cycle, compute the bounds of its frames, and make the configured estimates.
 
-    Raises
-    ------
-    InputError
-        If the true cycle fails on one of the meshes, or a setting is inadmissible.
+    InputError if the true cycle fails on one of the meshes, or a setting is inadmissible.
     """
     values, settings = job.values, job.settings.cycle
     truth = np.array(values["truth"]["values"], dtype=float)

@@ -65,11 +65,8 @@ def find_loops(
     The free edge is the loop nearer to the papillary tips (mean distance of its vertices from
     their nearest tips). A given loop keeps its order.
 
-    Raises
-    ------
-    GeometryError
-        There are not exactly two boundary loops, or a given list is not one of them; the loop near
-        the tips is the wider one, as if the tips were on the atrial side.
+    GeometryError if there are not exactly two boundary loops, or a given list is not one of them;
+    the loop near the tips is the wider one, as if the tips were on the atrial side.
     """
     loops = two_loops(vertices, triangles)
     outer = None if annulus is None else _which("annulus", annulus, loops)

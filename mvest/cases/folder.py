@@ -78,11 +78,8 @@ GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)
 def read_case(path: Path | str) -> ValveCase:
     """Read a case folder (the folder with ``case.yaml``).
 
-    Raises
-    ------
-    InputError, GeometryError
-        Anything missing, unknown, inadmissible or contradictory: one error with file, field,
-        numbers, and what would be right.
+    InputError or GeometryError for anything missing, unknown, inadmissible or contradictory: one
+    error with file, field, numbers, and what would be right.
     """
     folder = CaseFolder(Path(path))
     if not folder.root.is_dir():

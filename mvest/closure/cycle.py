@@ -95,10 +95,7 @@ class CycleProtocol:
     def frame_sets(self) -> dict[str, list[int]]:
         """Named sets of observed frames: increasing numbers of frames, and parts of the cycle.
 
-        Raises
-        ------
-        InputError
-            If the valve is not held closed in any frame.
+        InputError if the valve is not held closed in any frame.
         """
         total = len(self.times)
         held = [k for k, time in enumerate(self.times) if self.phase(time) > 1 - 1e-9]
@@ -159,12 +156,7 @@ class CycleModel:
     def frames(self, m: FloatArray) -> FloatArray:
         """Positions ``(f, n, 3)`` mm of the observed vertices with parameters ``m (p,)``.
 
-        Raises
-        ------
-        MaterialError
-            If a modulus is inadmissible.
-        InputError
-            If the cycle does not converge.
+        MaterialError if a modulus is inadmissible. InputError if the cycle does not converge.
         """
         simulation = self.run(m, sensitivities=False)
         if not simulation.converged:

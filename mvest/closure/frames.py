@@ -37,10 +37,7 @@ def is_frame_pressure(name: str) -> bool:
 class FramesModel:
     """A model of the open valve and several closed frames.
 
-    Raises
-    ------
-    InputError
-        If an error refers to no frame, or `SCALE` is missing.
+    InputError if an error refers to no frame, or `SCALE` is missing.
     """
 
     model: ClosureModel  #: closes the valve to the closed frame, under the pressure of its protocol

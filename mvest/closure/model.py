@@ -161,10 +161,7 @@ class ClosureModel:
 
         The system is built once and belongs to the model.
 
-        Raises
-        ------
-        MaterialError
-            If a modulus is inadmissible.
+        MaterialError if a modulus is inadmissible.
         """
         values = self._values(m)
         if self._system is None:

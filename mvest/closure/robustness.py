@@ -108,10 +108,8 @@ class GateReport:
 def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
     """A fresh model that closes from the open valve, with a case's changes except the mesh.
 
-    Raises
-    ------
-    InputError
-        If the case needs another mesh or other contact samples; these must come from an anatomy.
+    InputError if the case needs another mesh or other contact samples; these must come from an
+    anatomy.
     """
     if case.remeshed:
         raise InputError(f"gate case {case.name!r} needs another mesh or other contact samples")

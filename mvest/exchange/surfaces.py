@@ -62,12 +62,9 @@ class Surface:
 def read_mesh(path: Path | str) -> Surface:
     """Read the points, triangles and lines of a file.
 
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, or its suffix is not one of `SURFACE_SUFFIXES`.
-    GeometryError
-        Points are not finite or beyond `MAX_NUMBER`, or cells name points that do not exist.
+    InputError if the file is missing or damaged, or its suffix is not one of `SURFACE_SUFFIXES`.
+    GeometryError if points are not finite or beyond `MAX_NUMBER`, or cells name points that do not
+    exist.
     """
     source = Path(path)
     _check_suffix(source, SURFACE_SUFFIXES)
@@ -85,10 +82,8 @@ def read_surface(path: Path | str) -> Surface:
 
     `mvest.valve.geometry.surface_checks` checks whether it is closed or manifold.
 
-    Raises
-    ------
-    InputError, GeometryError
-        As `read_mesh`; or there are no triangles, or there are cells of other types.
+    InputError or GeometryError as `read_mesh`; or there are no triangles, or there are cells of
+    other types.
     """
     found = read_mesh(path)
     if found.others:
@@ -257,10 +252,8 @@ def write_surface(
 
     ``space`` ("LPS") names the axes for 3D Slicer.
 
-    Raises
-    ------
-    InputError, GeometryError
-        The suffix differs, a point is not finite, or the file cannot be written.
+    InputError or GeometryError if the suffix differs, a point is not finite, or the file cannot be
+    written.
     """
     target = Path(path)
     _check_suffix(target, (".vtp",))

@@ -140,10 +140,7 @@ def read_volume(
 def read_labels(path: Path | str) -> LabelMap:
     """Read a label map or segmentation: NRRD, MetaImage or NIfTI of three or four axes.
 
-    Raises
-    ------
-    InputError
-        As `read_volume`; or the file is an image, has no labels, or has non-integer values.
+    InputError as `read_volume`; or the file is an image, has no labels, or has non-integer values.
     """
     found = _read(Path(path), True)
     del found["sha256"]
@@ -164,10 +161,7 @@ def write_sequence_nrrd(path: Path | str, sequence: VolumeSequence) -> Path:
     Equal content gives equal bytes. The frame axis comes first; all versions of Slicer can read
     that order.
 
-    Raises
-    ------
-    InputError
-        The name or voxel type is not supported, or the file cannot be written.
+    InputError if the name or voxel type is not supported, or the file cannot be written.
     """
     target = sequence_path(path)
     if (found := sequence.frames.dtype.name) not in WRITABLE:

@@ -44,10 +44,7 @@ def smooth_step(u: float) -> float:
 class ExponentialTissue:
     """Coefficients of one region.
 
-    Raises
-    ------
-    MaterialError
-        If a coefficient is not positive (c1, c2 and viscous may be zero).
+    MaterialError if a coefficient is not positive (c1, c2 and viscous may be zero).
     """
 
     c0: Modulus  #: MPa, scale of the exponential

@@ -374,10 +374,7 @@ def held_loading(
 ) -> Callable[[float], Loads]:
     """Time -> the constant loads of a further frame.
 
-    Raises
-    ------
-    InputError
-        If the numbers of annulus points or tips are not those of the valve.
+    InputError if the numbers of annulus points or tips are not those of the valve.
     """
     rest = contact_valve.motion.annulus[0]
     for name, given, own in (

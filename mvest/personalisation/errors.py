@@ -269,10 +269,7 @@ def linearise(
 def with_samples(errors: FrameErrors, valve: ClosedValve) -> FrameErrors:
     """The errors with the effect of the case's error samples about a closed valve.
 
-    Raises
-    ------
-    GeometryError
-        If that cannot be computed.
+    GeometryError if that cannot be computed.
     """
     case = errors.fitted.case
     found = sample_frames(case, valve)

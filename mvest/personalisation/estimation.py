@@ -119,11 +119,8 @@ class CaseProblem:
 
         ``model`` comes from `build_model` and may have been closed.
 
-        Raises
-        ------
-        InputError
-            If the case lacks an unknown, has error samples and several fitted frames, or errors of
-            pressures are unknown but their common factor is not.
+        InputError if the case lacks an unknown, has error samples and several fitted frames, or
+        errors of pressures are unknown but their common factor is not.
         """
         settings = with_pressures(case, settings)
         if case.fitted and case.error_samples is not None:

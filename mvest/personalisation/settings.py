@@ -187,10 +187,7 @@ def with_stiffening(settings: PersonaliseSettings) -> PersonaliseSettings:
 
     The unknown leads from the linear law to that of `PersonaliseSettings.nuisance_law`.
 
-    Raises
-    ------
-    InputError
-        If there is no such leaflet or no such law, or its tissue is not linear.
+    InputError if there is no such leaflet or no such law, or its tissue is not linear.
     """
     tissue, laws = dict(settings.mechanics.tissue), dict(settings.nuisance_law)
     for unknown in settings.unknowns:

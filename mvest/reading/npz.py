@@ -106,10 +106,7 @@ def check_array(
 
     A length of None matches any. ``where`` names the array in errors.
 
-    Raises
-    ------
-    InputError
-        The kind or shape differs, or a number is not finite.
+    InputError if the kind or shape differs, or a number is not finite.
     """
     sizes = zip(shape, array.shape, strict=False)
     fits = array.ndim == len(shape) and all(want in (None, have) for want, have in sizes)

@@ -146,10 +146,7 @@ def valve_planes(valve: ValveSequence, frame: int) -> dict[str, SlicePlane]:
     anterior side up: one through the centre of the annulus, and one 1 mm above the middle of the
     higher free edge, which cuts both leaflets.
 
-    Raises
-    ------
-    GeometryError
-        Positions are not finite, or are on one line.
+    GeometryError if positions are not finite, or are on one line.
     """
     named, tips = landmarks(valve, frame), valve.tips[frame]
     if not (np.isfinite(valve.vertices[frame]).all() and np.isfinite(tips).all()):

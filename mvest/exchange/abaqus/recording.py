@@ -79,10 +79,7 @@ class Recording:
 def recording_files(folder: Path) -> list[Path]:
     """The deck of a folder, followed by its frames in order.
 
-    Raises
-    ------
-    InputError
-        The deck or a frame is missing.
+    InputError if the deck or a frame is missing.
     """
     deck = folder / f"{folder.name}.inp"
     if not deck.is_file():
@@ -104,10 +101,8 @@ def read_recording(
 
     Names are case-insensitive and may include their instance.
 
-    Raises
-    ------
-    InputError
-        Files are missing or damaged, or the deck has unsupported content or contradicts the frames.
+    InputError if files are missing or damaged, or the deck has unsupported content or contradicts
+    the frames.
     """
     path, *files = recording_files(folder)
     with refusing(path, "input deck"):

@@ -51,10 +51,7 @@ class Differences:
     def neighbours(self, m: FloatArray) -> FloatArray:
         """Parameters ``(2 p, p)`` of the runs: upper neighbours of ``m``, then lower neighbours.
 
-        Raises
-        ------
-        InputError
-            A parameter is so small that its step vanishes.
+        InputError if a parameter is so small that its step vanishes.
         """
         step = self.relative_step * np.maximum(np.abs(m), self.floor)
         if len(bad := np.flatnonzero(m + step == m)):

@@ -81,10 +81,7 @@ def febio_mesh(mesh: SolidMesh) -> SolidMesh:
 
     Elements with two layers of nodes get a third one halfway between them.
 
-    Raises
-    ------
-    InputError
-        FEBio has no such element.
+    InputError if FEBio has no such element.
     """
     kind = mesh.element_type
     if kind in NAMES:
@@ -297,10 +294,7 @@ class FebDocument:
     def write(self, path: Path, remark: str = "") -> Path:
         """Write the file with a remark at its head; FEBio will log to `positions_file`.
 
-        Raises
-        ------
-        InputError
-            The file cannot be written.
+        InputError if the file cannot be written.
         """
         self._log.set("file", positions_file(path).name)
         root = Xml.Element("febio_spec", version="4.0")

@@ -51,10 +51,7 @@ def chordae_of_lines(segments: FloatArray, tips: FloatArray, free_edge: FloatArr
     basal. Each family is as stiff at the tips as that of the template, each of its leaflet ends has
     the same share, and a trunk is as stiff as its branches together.
 
-    Raises
-    ------
-    InputError
-        Chords begin elsewhere than at the tips, meet, or form a cycle.
+    InputError if chords begin elsewhere than at the tips, meet, or form a cycle.
     """
     points, pairs = _graph(segments)
     branches = np.isin(pairs[:, 1], pairs[:, 0])

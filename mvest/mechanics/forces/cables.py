@@ -82,10 +82,7 @@ class Cables:
     def members(self, part: str) -> BoolArray:
         """Segments ``(k,)`` of a family or papillary tip (``tip0``, ...); all if ``part`` is empty.
 
-        Raises
-        ------
-        InputError
-            If there is no such part.
+        InputError if there is no such part.
         """
         if not part:
             return np.ones(len(self.rest_length), dtype=np.bool_)

@@ -203,10 +203,7 @@ def _only_row(record: EstimateRecord, name: str) -> Mapping[str, Any]:
 def _embedded(path: Path) -> dict[str, Any]:
     """A picture as a data address ``source``, with ``width`` and ``height`` in pixels.
 
-    Raises
-    ------
-    InputError
-        If the picture cannot be read.
+    InputError if the picture cannot be read.
     """
     try:
         with Image.open(path) as stored:

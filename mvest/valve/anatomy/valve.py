@@ -124,11 +124,8 @@ def lumped_areas_change(vertices: FloatArray, triangles: IntArray, moves: FloatA
 class LeafletSurface:
     """Midsurface of all leaflets in the reference (open) frame.
 
-    Raises
-    ------
-    InputError, GeometryError
-        Wrong shapes, values that are not finite, unknown regions, thickness that is not positive,
-        or fibres without direction.
+    InputError or GeometryError for wrong shapes, values that are not finite, unknown regions,
+    thickness that is not positive, or fibres without direction.
     """
 
     vertices: FloatArray  #: (n, 3) mm
@@ -180,11 +177,8 @@ class Chordae:
     The k = c + j segments form trees, each rooted at a papillary tip. Segment i < c ends at
     insertion i, segment c + i at junction i. Straight chordae have no junctions.
 
-    Raises
-    ------
-    InputError
-        Wrong shapes, values that are not finite or not positive, unknown families or parents, or
-        segments that form no trees.
+    InputError for wrong shapes, values that are not finite or not positive, unknown families or
+    parents, or segments that form no trees.
     """
 
     tip: IntArray  #: ``(k,)`` index of the papillary tip at the root

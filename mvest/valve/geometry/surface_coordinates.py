@@ -81,11 +81,8 @@ class SurfaceCoordinates:
 def boundary_loops(triangles: IntArray) -> list[IntArray]:
     """Boundary loops of a triangulation, each in the direction of its triangles.
 
-    Raises
-    ------
-    GeometryError
-        An edge has more than two triangles, neighbours differ in orientation, or a boundary vertex
-        has more than two boundary edges.
+    GeometryError if an edge has more than two triangles, neighbours differ in orientation, or a
+    boundary vertex has more than two boundary edges.
     """
     triangles = np.asarray(triangles)
     directed, edges, number, count = edge_table(triangles)

@@ -30,10 +30,7 @@ def smooth_vertex_normals(
     Each iteration averages a normal with the mean of its neighbours' normals, and normalises it.
     Thickening along raw normals would make triangles cross at sharp bends, such as the commissures.
 
-    Raises
-    ------
-    GeometryError
-        A vertex has no triangle, or opposite normals cancel.
+    GeometryError if a vertex has no triangle, or opposite normals cancel.
     """
     return smooth_normals_change(vertices, triangles, iterations, np.zeros((*vertices.shape, 0)))[0]
 
@@ -89,10 +86,7 @@ def _across(normals: FloatArray, change: FloatArray) -> FloatArray:
 class ClosedSurface:
     """Outer surface of thickened leaflets, with outward normals.
 
-    Raises
-    ------
-    GeometryError
-        The surface is not closed, manifold, outward and free of self-intersections.
+    GeometryError if the surface is not closed, manifold, outward and free of self-intersections.
     """
 
     vertices: FloatArray  #: (n, 3) mm

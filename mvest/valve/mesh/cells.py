@@ -118,10 +118,7 @@ def local_faces(element_type: str) -> IntArray:
 def boundary(elements: IntArray, element_type: str) -> tuple[IntArray, IntArray]:
     """Faces of one element only: their elements ``(f,)`` and local numbers ``(f,)``.
 
-    Raises
-    ------
-    GeometryError
-        If a face belongs to more than two elements.
+    GeometryError if a face belongs to more than two elements.
     """
     local = local_faces(element_type)
     faces = np.sort(elements[:, local].reshape(-1, local.shape[1]), axis=1)

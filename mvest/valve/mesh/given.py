@@ -30,10 +30,7 @@ class GivenValve(Band):
     def layers(self, element: str, columns: int, rows: int, layers: int = 1) -> SolidMesh:
         """A mesh of ``columns x rows x layers`` cells.
 
-        Raises
-        ------
-        GeometryError
-            If cells are folded.
+        GeometryError if cells are folded.
         """
         try:
             return structured_mesh(self, element, columns, rows, layers)

@@ -60,12 +60,8 @@ def remesh(
 
     The result has ``vertices`` vertices, or fewer if all fine ones off the loops are kept.
 
-    Raises
-    ------
-    InputError
-        If ``vertices`` is too small for the two loops or above the number of fine vertices.
-    GeometryError
-        If the surface is not a band, or the triangulation loses an edge of a loop.
+    InputError if ``vertices`` is too small for the two loops or above the number of fine vertices.
+    GeometryError if the surface is not a band, or the triangulation loses an edge of a loop.
     """
     x = surface.vertices
     if not 24 <= vertices <= len(x):
