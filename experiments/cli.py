@@ -4,8 +4,6 @@ Exit status as in ``experiments.run``: 0 done; 1 no estimate; 2 the request is w
 how); 130, 143 or 129 stopped by Ctrl-C, SIGTERM or SIGHUP.
 """
 
-from __future__ import annotations
-
 import difflib
 import pkgutil
 import re

@@ -17,8 +17,6 @@ Conventions
   and Roehl 1994, Int. J. Numer. Meth. Engng 37:2551).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

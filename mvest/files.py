@@ -1,7 +1,5 @@
 """Atomic writing of files and folders, and their digests."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

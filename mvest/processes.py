@@ -7,8 +7,6 @@ left the program's process group (prctl(2), child subreaper), and the program di
 is killed. Only the standard library is imported, so a supervisor starts in milliseconds.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import resource

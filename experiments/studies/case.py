@@ -1,7 +1,5 @@
 """Estimates moduli with intervals for your own valve, from a case folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ the true geometry (known geometry), and the true geometry with the error of a vo
 segmentation). Errors that remain in these two are not caused by the images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

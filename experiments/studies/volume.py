@@ -1,7 +1,5 @@
 """Estimates moduli with intervals from your own volume over time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -13,8 +13,6 @@ Each check raises one error for the first fault: what is wrong and what would be
 of a case adds file and field.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from typing import NamedTuple
 

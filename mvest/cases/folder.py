@@ -4,8 +4,6 @@
 errors of all frames are one file of named arrays, NumPy's ``.npz``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

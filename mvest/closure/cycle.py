@@ -5,8 +5,6 @@ parameters, so the state is not estimated. New parameters require a new run of t
 that parameters and state are consistent in every frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, zip_longest

@@ -6,8 +6,6 @@ its own pressure, annulus and papillary tips, reached from the previous frame. A
 scale and offset for all frames (calibration and zero of the sensor) and one error per frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

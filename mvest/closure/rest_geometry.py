@@ -5,8 +5,6 @@ on the surface and its fraction of the thickness. Embeddings do not change, so t
 points are observed, touch and are held.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property

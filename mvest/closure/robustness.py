@@ -6,8 +6,6 @@ compares the closed surfaces. It also follows the closed surface along changing 
 (:mod:`mvest.closure.smoothness`): the path may curve but must not jump.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ those of :math:`U S U / \det U`. Computed from the Green-Lagrange strain rather 
 include the enhanced strain of solid-shells, which is not part of F.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mvest.errors import InputError

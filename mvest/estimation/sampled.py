@@ -20,8 +20,6 @@ The variance of K samples is uncertain itself: c = (t / 1.96)² with t the 97.5 
 distribution with K degrees of freedom, so that ± 1.96 standard deviations are a 95 % interval.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -13,8 +13,6 @@ Machine Learning, 2006, section 8.1). The rest is spread evenly over all directi
 costs k m² once, and k m for whitening a vector.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

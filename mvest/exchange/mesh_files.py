@@ -4,8 +4,6 @@ VTK reads its own formats and OBJ; trimesh reads PLY and GLB. STL is read here, 
 truncated STL files.
 """
 
-from __future__ import annotations
-
 import importlib
 import io
 import json

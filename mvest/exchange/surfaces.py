@@ -6,8 +6,6 @@ merged in surfaces from several files, and in STL, OBJ and GLB files. Merged ver
 in triangle order, so that two files with the same triangles in the same order correspond.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -9,8 +9,6 @@ centimetres taken for millimetres, a mask, a localiser. A label map may be small
 an image.
 """
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import io

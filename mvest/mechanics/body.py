@@ -3,8 +3,6 @@
 Rectangular blocks of any element serve as sheets, strips and patches for examples and verification.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

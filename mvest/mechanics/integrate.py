@@ -19,8 +19,6 @@ Numer. Meth. Engng 37:2471): with the factorised A of the converged step, for ea
           - \partial_{\epsilon_n} f_{int} \, d\epsilon_n .
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple

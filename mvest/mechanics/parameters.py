@@ -5,8 +5,6 @@ papillary tip, or the leaflet and number of a mode. Each law lists the kinds tha
 (:attr:`mvest.mechanics.law.Law.kinds`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from enum import Enum

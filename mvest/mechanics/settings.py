@@ -1,7 +1,5 @@
 """Settings of the mechanics: tissue, closure protocol, contact and numerics."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 

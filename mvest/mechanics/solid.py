@@ -17,8 +17,6 @@ against constant stress: the patch test holds. With the corotational law the str
 one in a frame that rotates with the element and replaces F.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Input and result of a simulation: steps, settings, frames, reasons."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -5,8 +5,6 @@ The residual is the internal minus the external force, so that equilibrium is ``
 inertia and mass-proportional damping. The tangent is dr/dx, exact in every term.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 

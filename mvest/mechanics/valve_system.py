@@ -4,8 +4,6 @@ Everything is defined in the reference frame and embedded, so that loads, contac
 do not depend on the mesh.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol

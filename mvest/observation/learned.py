@@ -6,8 +6,6 @@ another follows from the observation itself (see `mvest.estimation.noise` and
 `mvest.estimation.evidence`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Observations of corresponding vertices, and what a model predicts of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

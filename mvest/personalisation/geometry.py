@@ -4,8 +4,6 @@ Open shape, annulus, papillary tips, thickness and fibre direction are measured 
 errors. `mvest.personalisation.sources` computes what the modes do to a prediction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

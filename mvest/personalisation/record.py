@@ -29,8 +29,6 @@ image_step     with image_frames and pictures: `DetectedValve.details`
 ============== ==================================================================================
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any

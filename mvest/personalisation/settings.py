@@ -1,7 +1,5 @@
 """Settings of a personalisation: unknowns with priors, mesh, filter and sources of error."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 

@@ -3,8 +3,6 @@
 All drawings of a case read them here. Arrays that a run did not store are None.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -5,8 +5,6 @@ points of the leaflets displaces them against this boundary and biases every mod
 parameter: predicted closed frames are rotated and shifted before the comparison.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 The key of a cache entry combines its input values and the code that made it (:mod:`mvest.cache`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

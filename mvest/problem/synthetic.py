@@ -1,7 +1,5 @@
 """Synthetic observations made from a known truth. Filters never receive the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

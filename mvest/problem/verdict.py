@@ -13,8 +13,6 @@ new seeds must confirm it. Two checks were dropped because they predicted no mis
 the fitted valve from the closed frame, and how much the data narrow the prior.
 """
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence

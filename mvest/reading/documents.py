@@ -5,8 +5,6 @@ and deep nesting raise an error. Only decimal literals are numbers; hexadecimal,
 sexagesimal literals, those with underscores, and dates are text.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """Reads plain arrays from NumPy's ``.npz``; checks the stated sizes before allocating any."""
 
-from __future__ import annotations
-
 import tokenize
 import zipfile
 import zlib

@@ -1,7 +1,5 @@
 """Reads bytes, text, numbers and small comma-separated tables from users, within bounds."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

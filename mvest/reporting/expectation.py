@@ -4,8 +4,6 @@ The Fisher information needs a model, a parameter set and the errors of the obse
 observed value. One run of the model therefore says which intervals to expect.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

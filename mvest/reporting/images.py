@@ -4,8 +4,6 @@ The slices lie in the usual planes of a mitral valve. All positions are LPS mm; 
 coordinates, mm to the right and up from its origin.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

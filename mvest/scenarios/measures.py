@@ -1,7 +1,5 @@
 """Measures of a closing valve, step by step, and of a closed valve."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mvest.closure.model import ClosureModel, ClosureResult

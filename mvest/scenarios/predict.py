@@ -1,7 +1,5 @@
 """Predicts one scenario at the estimate and at samples of its posterior."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Scenarios are simulated; none of them is a recommendation.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

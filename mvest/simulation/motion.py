@@ -8,8 +8,6 @@ papillary tips return part of their way, each in equilibrium. Motions that no va
 refused, so that no detector learns from them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Trials of detectors on simulated volumes of valves that are not in the training."""
 
-from __future__ import annotations
-
 import json
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The open and the closed frame of a sequence, and the case that they make."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

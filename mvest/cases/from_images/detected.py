@@ -1,7 +1,5 @@
 """From a volume over time to a case: the valve is detected, measured and written."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -12,8 +12,6 @@ Valves and detectors are nearly symmetric about the middle of the leaflets. So t
 part of errors and shapes are regressed separately.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

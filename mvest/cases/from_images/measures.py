@@ -1,7 +1,5 @@
 """Measures of a valve from images in every frame, and its files for ParaView and 3D Slicer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias

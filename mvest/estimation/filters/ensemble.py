@@ -1,7 +1,5 @@
 """Ensemble Kalman filter and smoother: covariances of many runs of the model."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

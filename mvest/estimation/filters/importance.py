@@ -1,7 +1,5 @@
 """Weighted draws from the posterior itself, whatever its form."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

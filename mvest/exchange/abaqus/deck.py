@@ -10,8 +10,6 @@ keyword line begins with one star, a comment with two; options are ``NAME=VALUE`
 matter. The instance prefix of a name is ignored.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field

@@ -11,8 +11,6 @@ Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w),
 **tricuspid** valve (three leaflets, right heart). It is not part of this package.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence

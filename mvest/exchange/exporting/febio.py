@@ -1,7 +1,5 @@
 """Exports a case as FEBio input (file format 4)."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path

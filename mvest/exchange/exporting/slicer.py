@@ -1,7 +1,5 @@
 """3D Slicer and ParaView: surfaces over time, and landmarks with the labels of SlicerHeart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

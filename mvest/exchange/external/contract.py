@@ -13,8 +13,6 @@ All files are text: JSON or comma-separated numbers. Each run has a folder::
 Anything else raises an error that names the file and the row.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

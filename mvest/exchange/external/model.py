@@ -3,8 +3,6 @@
 All data pass through files. Without derivatives from the program, differences are used.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack

@@ -15,8 +15,6 @@ counterclockwise, corners of the upper face, midpoints of the lower, the upper a
 edges; for a brick also the midpoints of its sides, its lower and its upper face, and its centre.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ its branching point, branches from there (a fan at the free edge, radial ones on
 leaflet).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 

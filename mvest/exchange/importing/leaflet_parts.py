@@ -1,7 +1,5 @@
 """Identifies the voxels or closed surfaces of each leaflet in a source."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Imports thick segmented leaflets: label maps, or closed surfaces of one or both leaflets."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

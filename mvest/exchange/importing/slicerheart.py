@@ -1,7 +1,5 @@
 """Imports SlicerHeart exports: leaflets, annulus, landmarks and papillary muscles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 A case is written to a folder and read back with the usual checks.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ vertices are uncertain, with a penalty on acceleration; a truncated Fourier seri
 closure itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -8,8 +8,6 @@ noise that grows with the distance from one side, and a threshold, none of which
 simulator. Kinds and amounts are a choice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated

@@ -13,8 +13,6 @@ within the sheet are always too close for the proof. No time step is accepted if
 intersect: it is repeated with detection throughout.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import ipctk

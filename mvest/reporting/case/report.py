@@ -4,8 +4,6 @@ The page opens from disk and loads nothing: pictures and the script of the turna
 embedded, and its content policy forbids every request. The template escapes all text.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

@@ -7,8 +7,6 @@ these take, and the first leaflet has the first section. Layered meshes, contact
 can therefore be laid out on any valve as on the template.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components

@@ -6,8 +6,6 @@ to a distance from the annulus that does not change. So the leaflets of a closed
 wherever they meet farther from the annulus, or deeper than their thickness.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -5,8 +5,6 @@ Everything here is exact geometry on plain arrays: vertices ``(n, 3)`` in mm and
 Collision Detection* (2005), section 5.1.5 (Voronoi regions of the triangle's features).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import chain
 

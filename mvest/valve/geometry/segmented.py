@@ -1,7 +1,5 @@
 """From segmented leaflets and papillary muscles to the midsurface, its error, and the tips."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

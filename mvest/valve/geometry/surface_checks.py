@@ -3,8 +3,6 @@
 Each fault raises a `GeometryError` that names the fault and the triangles, edges or vertices.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components

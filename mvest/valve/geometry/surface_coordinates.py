@@ -16,8 +16,6 @@ negative weights around folded triangles are raised until no fold is left. The c
 harmonic except at those few edges.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

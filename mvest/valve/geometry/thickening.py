@@ -1,7 +1,5 @@
 """Thickens a midsurface to the closed surface of its leaflets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -10,8 +10,6 @@ the position over the surface at rest are averages over the triangles at both en
 The weights depend only on the surface at rest, so derivatives by the vertices are exact.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ the surface at a vertex gives the opposite point (shrinking balls: Ma, Bae and C
 Comput. 28:7).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The annulus: its plane, the three clinical directions, its size and its minimal surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -19,8 +19,6 @@ annulus centre that holds its normal and the anterior direction.
   annulus points; ``tip_separation``: between the tips.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeAlias
 

@@ -8,8 +8,6 @@ line of sight from the atrium counts as open only if it is farther from every le
 distance at which two of them touch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

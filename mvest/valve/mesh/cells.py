@@ -4,8 +4,6 @@ A lattice has two steps along each axis of a cell, so that mid-edge nodes are la
 is one brick, two wedges or six tetrahedra.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mvest.elements import element

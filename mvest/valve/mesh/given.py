@@ -5,8 +5,6 @@ meshed with tetrahedra. That mesher keeps neither vertices nor labels, so these 
 nearness: regions and fibres from the midsurface, pressure faces from the closed surface.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

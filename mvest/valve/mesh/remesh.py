@@ -11,8 +11,6 @@ normal, from the atrial (``zeta = -1``) to the ventricular face. Raw normals and
 could invert wedges at sharp bends, such as the commissures.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

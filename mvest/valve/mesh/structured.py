@@ -3,8 +3,6 @@
 Every node lies on the exact surface, so that refined meshes converge to one and the same body.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mvest.errors import InputError

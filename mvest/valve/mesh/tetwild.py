@@ -5,8 +5,6 @@ deterministic. Therefore the surface is checked first, the mesher runs in a chil
 result is checked against the surface, and the mesh is cached under the hash of its input.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import subprocess
