@@ -46,10 +46,4 @@ def _read(values: Mapping[str, Any]) -> ValveCase:
     return case
 
 
-STUDY = Study(
-    settings=Settings,
-    run=run,
-    words=case_words,
-    files=write_report,
-    check=check_case,
-)
+STUDY = Study(settings=Settings, run=run, words=case_words, files=write_report, check=check_case)

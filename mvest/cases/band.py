@@ -257,10 +257,7 @@ def _edges(triangle: tuple[int, ...]) -> list[tuple[int, int]]:
 
 
 def _turn(
-    triangles: list[tuple[int, ...]],
-    owner: dict[tuple[int, int], int],
-    ear: int,
-    loop_of: IntArray,
+    triangles: list[tuple[int, ...]], owner: dict[tuple[int, int], int], ear: int, loop_of: IntArray
 ) -> bool:
     """Flip an inner edge of an ear, if a neighbour has a corner elsewhere."""
     for b, c in _edges(triangles[ear]):

@@ -21,13 +21,7 @@ from mvest.cases.case import (
     check_different,
     check_frames,
 )
-from mvest.cases.frames import (
-    LOOPS,
-    SeenFrame,
-    place_frame,
-    read_frame,
-    reference_band,
-)
+from mvest.cases.frames import LOOPS, SeenFrame, place_frame, read_frame, reference_band
 from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, PointData
 from mvest.cases.tissue import point_data, read_chordae, read_leaflets, write_chordae
 from mvest.errors import InputError

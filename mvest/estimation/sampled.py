@@ -91,10 +91,7 @@ class SampledErrors:
         return low_rank_noise(self.base, self.columns)
 
     def posterior(
-        self,
-        jacobian: FloatArray,
-        prior: FloatArray,
-        curvature: FloatArray | None = None,
+        self, jacobian: FloatArray, prior: FloatArray, curvature: FloatArray | None = None
     ) -> SampledPosterior:
         """Covariance of an estimate with H ``(n, p)`` and the prior's covariance P ``(p, p)``.
 

@@ -226,9 +226,7 @@ def _force_curve(
     return lambda t: constant
 
 
-def _pressure_curve(
-    pressure: Callable[[float], float] | ArrayLike,
-) -> Callable[[float], float]:
+def _pressure_curve(pressure: Callable[[float], float] | ArrayLike) -> Callable[[float], float]:
     if callable(pressure):
         return pressure
     table = np.asarray(pressure, dtype=float)

@@ -33,14 +33,7 @@ from mvest.mechanics.law import Points
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import SolidState
 from mvest.mechanics.solver import EXACT, LinearSolver, linear_solver
-from mvest.mechanics.steps import (
-    Damping,
-    NewtonSettings,
-    Simulation,
-    Step,
-    StepReason,
-    StepRecord,
-)
+from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step, StepReason, StepRecord
 from mvest.mechanics.system import Evaluation, Loads, System
 from mvest.typing import FloatArray
 

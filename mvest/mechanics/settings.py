@@ -117,10 +117,7 @@ class TissueSettings:
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of the parameters of the tissue."""
-        kinds = {
-            "exponential": ("E_f", *EXPONENTIAL_KINDS),
-            "stiffening": ("E_f", "stiffening"),
-        }
+        kinds = {"exponential": ("E_f", *EXPONENTIAL_KINDS), "stiffening": ("E_f", "stiffening")}
         own = kinds.get(self.law, ("E_f",))
         return own if self.law == "corotational" else (*own, "prestretch")
 

@@ -124,10 +124,7 @@ class FrameErrors:
         return family.without_columns().at(log, beats)
 
     def noise(
-        self,
-        learned: LearnedNoise | None = None,
-        *,
-        without: Collection[str] = (),
+        self, learned: LearnedNoise | None = None, *, without: Collection[str] = ()
     ) -> ObservationNoise:
         """Noise of the observation except for error samples and the sources ``without``."""
         base = self.single_noise(learned)

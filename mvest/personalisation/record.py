@@ -41,15 +41,7 @@ from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.result import Personalised
 from mvest.problem.estimate import StudyResult
 from mvest.problem.fields import as_stored, chord_fields
-from mvest.problem.record import (
-    EstimateRecord,
-    FrameFit,
-    Numbers,
-    Row,
-    Spread,
-    finite,
-    record_of,
-)
+from mvest.problem.record import EstimateRecord, FrameFit, Numbers, Row, Spread, finite, record_of
 from mvest.problem.verdict import judge
 from mvest.valve.measure.clinical import clinical_measurements
 

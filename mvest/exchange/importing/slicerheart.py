@@ -182,12 +182,7 @@ def _frames(
             leaflets, commissures, down = _placed(seen, tips, options.mirrored, notes)
             # Closed edges touch all along, so they are joined as far as the open ones.
             surface, seams, gap = joined(
-                leaflets,
-                commissures,
-                seen.contour,
-                down,
-                offset_mm=offset,
-                seams=seams,
+                leaflets, commissures, seen.contour, down, offset_mm=offset, seams=seams
             )
         shares = ", ".join(f"{100 * share:.0f}" for share in seams.ravel())
         notes.append(

@@ -99,10 +99,7 @@ class ThickLeaflets(NamedTuple):
 
 
 def fields_of_masks(
-    masks: Sequence[BoolArray],
-    spacing: FloatArray,
-    blur: float,
-    step_mm: float = STEP_MM,
+    masks: Sequence[BoolArray], spacing: FloatArray, blur: float, step_mm: float = STEP_MM
 ) -> tuple[LeafletFields, FloatArray]:
     """Compute signed distances to sets of voxels.
 
@@ -158,11 +155,7 @@ def fields_of_masks(
         return np.asarray(ndimage.gaussian_filter(fine, blur * voxel / step))
 
     fields = LeafletFields(
-        np.stack([distance(mask) for mask in masks]),
-        distance(both),
-        step,
-        blur * voxel,
-        voxel,
+        np.stack([distance(mask) for mask in masks]), distance(both), step, blur * voxel, voxel
     )
     return fields, low.astype(np.float64)
 

@@ -134,10 +134,7 @@ class Refinement:
 
 
 def refined(
-    vertices: FloatArray,
-    triangles: IntArray,
-    edge_length: float,
-    loops: tuple[IntArray, ...] = (),
+    vertices: FloatArray, triangles: IntArray, edge_length: float, loops: tuple[IntArray, ...] = ()
 ) -> Refinement:
     """Halve the edges of a surface until their median length is small enough.
 

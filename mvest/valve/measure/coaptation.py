@@ -18,12 +18,7 @@ from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.geometry.proximity import (
-    closest_on_triangle,
-    closest_points,
-    plane_section,
-    row,
-)
+from mvest.valve.geometry.proximity import closest_on_triangle, closest_points, plane_section, row
 from mvest.valve.geometry.triangles import areas, unit_normals
 from mvest.valve.measure.annulus import AnnulusPlane
 
@@ -45,12 +40,7 @@ class LeafletProjection:
 
 @njit(cache=True)
 def _rasterise(
-    points: FloatArray,
-    triangles: IntArray,
-    x0: float,
-    y0: float,
-    step: float,
-    depth: FloatArray,
+    points: FloatArray, triangles: IntArray, x0: float, y0: float, step: float, depth: FloatArray
 ) -> None:
     """Set `depth` at all pixel centres to that of the first triangle that covers them."""
     rows, columns = depth.shape

@@ -23,11 +23,7 @@ from mvest.typing import IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.surface_coordinates import (
-    boundary_loops,
-    surface_coordinates,
-    wrapped,
-)
+from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates, wrapped
 from mvest.valve.geometry.triangles import edge_table, surface_edges, unit_rows
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
@@ -113,10 +109,7 @@ def remesh(
 
 
 def layered_wedges(
-    surface: LeafletSurface,
-    onto: LeafletSurface,
-    element_type: str = "wedge12",
-    layers: int = 1,
+    surface: LeafletSurface, onto: LeafletSurface, element_type: str = "wedge12", layers: int = 1
 ) -> SolidMesh:
     """Thicken a midsurface into layers of six-node-triangle wedges.
 
