@@ -103,6 +103,8 @@ def get_or_make(
 
     If several processes need the same entries, the first makes them and the others wait.
 
+    InputError if the cache cannot be written.
+
     Parameters
     ----------
     entries : sequence of Entry
@@ -117,11 +119,6 @@ def get_or_make(
     -------
     list
         Values as read from the cache, also if they were just made.
-
-    Raises
-    ------
-    InputError
-        If the cache cannot be written.
     """
     values: list[Any] = [entry.found() for entry in entries]
     left = [k for k, value in enumerate(values) if value is None]

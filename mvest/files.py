@@ -24,6 +24,8 @@ def write_atomically(
     An existing one is replaced. Interruptions leave no partial content, and other processes see
     none.
 
+    InputError if it cannot be written.
+
     Parameters
     ----------
     path : Path or str
@@ -38,11 +40,6 @@ def write_atomically(
     -------
     Path
         ``path``.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
     """
     target = Path(path)
     part = target.with_name(f"{PREFIX}{uuid.uuid4().hex}-{target.name}")

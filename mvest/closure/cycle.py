@@ -186,6 +186,8 @@ def compare_time_steps(
 ) -> list[dict[str, Any]]:
     """Measure how the frames of a cycle depend on the time step, along a path of parameters.
 
+    InputError if a step is not half of the one before.
+
     Parameters
     ----------
     model : CycleModel
@@ -200,11 +202,6 @@ def compare_time_steps(
         the step is halved; its ``order``, the binary logarithm of the ratio of two such changes;
         ``unevenness``, the largest over the median change along the path, large if frames jump; and
         the ``reason`` why the path ended early. Unknown numbers are None.
-
-    Raises
-    ------
-    InputError
-        If a step is not half of the one before.
     """
     if any(not np.isclose(b, 0.5 * a) for a, b in pairwise(dts)):
         raise InputError(f"time steps {list(dts)} s, expected each to be half of the one before")
@@ -237,6 +234,8 @@ def with_mesh_error(
 ) -> tuple[Estimate, FloatArray, float]:
     """Add the mesh error to the covariance of an estimate from a whole cycle.
 
+    InputError if there is no prediction, or no cycle on the other mesh.
+
     Parameters
     ----------
     found : Estimate
@@ -253,11 +252,6 @@ def with_mesh_error(
         Shift due to the mesh, in units of the parameters.
     float
         mm, mean distance between the frames of the two meshes.
-
-    Raises
-    ------
-    InputError
-        If there is no prediction, or no cycle on the other mesh.
     """
     frames = other.frames(found.mean)
     if found.prediction is None:

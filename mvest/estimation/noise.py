@@ -277,6 +277,8 @@ class NoiseFamily:
     def at(self, log: FloatArray, beats: float = 1.0) -> ObservationNoise:
         """The noise for given quantities.
 
+        InputError if there is less than one beat, or no noise is left.
+
         Parameters
         ----------
         log : (h,)
@@ -285,11 +287,6 @@ class NoiseFamily:
             Heart beats whose mean is observed, may be infinite. It divides the variances of the
             smooth and the rough part, which are independent from beat to beat. Resolution and added
             columns are the same in every beat.
-
-        Raises
-        ------
-        InputError
-            If there is less than one beat, or no noise is left.
         """
         if not beats >= 1.0:
             raise InputError(f"mean of {beats} beats, expected >= 1")

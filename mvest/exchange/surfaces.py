@@ -102,6 +102,9 @@ def read_regions(
     ``region``, the point data ``region`` (a triangle takes the label that two corners share), the
     object names (GLB). A single region needs no labels.
 
+    InputError or GeometryError if a file is missing or damaged, labels are missing or unknown, or a
+    region has no triangles.
+
     Parameters
     ----------
     files
@@ -109,11 +112,6 @@ def read_regions(
     regions
         Region of every number in the data, or of every object name; several may share a region.
         The regions are numbered in the order of their first label.
-
-    Raises
-    ------
-    InputError, GeometryError
-        A file is missing or damaged, labels are missing or unknown, or a region has no triangles.
     """
     if isinstance(files, Path):
         with refusing(files, "surface"):

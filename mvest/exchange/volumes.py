@@ -106,6 +106,9 @@ def read_volume(
 ) -> VolumeSequence:
     """Read a volume over time, or a single frame. Left-handed directions stay left-handed.
 
+    InputError if the file is damaged, has an unsupported format, lacks required information,
+    contradicts an argument, or is not a plausible image of a heart.
+
     Parameters
     ----------
     path
@@ -117,12 +120,6 @@ def read_volume(
         Seconds between frames, for files that give no times in a unit of time.
     time_unit
         ``"s"`` or ``"ms"``, for files that give times without a unit.
-
-    Raises
-    ------
-    InputError
-        The file is damaged, has an unsupported format, lacks required information, contradicts an
-        argument, or is not a plausible image of a heart.
     """
     source = Path(path)
     if source.is_dir():

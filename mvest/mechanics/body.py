@@ -52,6 +52,10 @@ def simulate_body(
 ) -> Simulation:
     """Simulate a body with fixed nodes, pressure on faces and forces on nodes.
 
+    InputError, GeometryError or MaterialError if an array has a wrong shape, an index out of
+    range or a value that is not finite; times do not increase; an element is inverted; a pressure
+    face belongs to no element or points into the solid; the material is invalid or needs a fibre.
+
     Parameters
     ----------
     nodes : array_like
@@ -103,13 +107,6 @@ def simulate_body(
     Simulation
         Frames ``(1 + completed steps, n, 3)`` mm, the initial state first, and the reason why the
         run ended. A run that does not converge is a result, not an exception.
-
-    Raises
-    ------
-    InputError, GeometryError, MaterialError
-        An array has a wrong shape, an index out of range or a value that is not finite; times do
-        not increase; an element is inverted; a pressure face belongs to no element or points into
-        the solid; the material is invalid or needs a fibre.
 
     Examples
     --------

@@ -107,6 +107,8 @@ def simulate(
 ) -> Simulation:
     """Integrate ``system`` over ``steps``.
 
+    InputError if the steps are not increasing.
+
     Parameters
     ----------
     system : System
@@ -137,11 +139,6 @@ def simulate(
     -------
     Simulation
         Holds the completed frames, and the reason for the end.
-
-    Raises
-    ------
-    InputError
-        If the steps are not increasing.
     """
     damping = damping or Damping()
     newton = newton or NewtonSettings()

@@ -209,16 +209,13 @@ class EdgeRotations:
     is the polar factor of A at x times the inverse of that at rest. This is the "polar" form of
     SOFA's tetrahedra, not the polar factor of the deformation gradient.
 
+    InputError if the elements are not linear tetrahedra.
+
     Parameters
     ----------
     mesh : SolidMesh
     frames : ndarray
         ``(e, 1, 3, 3)`` fibre frames, columns as in :mod:`mvest.mechanics.solid`.
-
-    Raises
-    ------
-    InputError
-        If the elements are not linear tetrahedra.
     """
 
     def __init__(self, mesh: SolidMesh, frames: FloatArray) -> None:

@@ -35,6 +35,9 @@ def read_npz(
 ) -> dict[str, NDArray[Any]]:
     """Read the arrays in a file, in native byte order; pickled objects are errors.
 
+    InputError if the file is missing or damaged, lacks an array or has others, or declares more
+    than `MAX_BYTES`.
+
     Parameters
     ----------
     path : Path or binary stream
@@ -46,12 +49,6 @@ def read_npz(
         Further arrays to read if present.
     where : str
         Name of the file in errors; its path by default.
-
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, lacks an array or has others, or declares more than
-        `MAX_BYTES`.
     """
     where = where or str(path)
     try:

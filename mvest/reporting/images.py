@@ -227,6 +227,8 @@ def montage_figure(
     Every row has the planes of its own frame, and all panels have one scale. Leaflets are drawn
     where the plane cuts them, annulus points and papillary tips if they are within 3 mm of it.
 
+    InputError if numbers or times of the frames differ.
+
     Parameters
     ----------
     volume, valve
@@ -236,11 +238,6 @@ def montage_figure(
         A frame to be shown.
     low_confidence : float
         Frames below this are marked in words and by a dashed frame.
-
-    Raises
-    ------
-    InputError
-        Numbers or times of the frames differ.
     """
     count, low = len(valve.times), ~(valve.frame_confidence >= low_confidence)
     if len(volume.times) != count or not np.allclose(

@@ -171,6 +171,8 @@ class Table:
 def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
     """A table from a data frame, or from rows that are mappings or dataclasses.
 
+    InputError if there are rows without a named column, or without one that belongs to it.
+
     Parameters
     ----------
     rows : iterable or DataFrame
@@ -178,11 +180,6 @@ def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
     **columns : Column or str
         Meaning of columns, in the order in which they come first; a text is
         ``unit:digits:label``, such as ``"mm:.2f"``, whose last parts may be missing.
-
-    Raises
-    ------
-    InputError
-        If there are rows without a named column, or without one that belongs to it.
     """
     plain = _plain_rows(rows)
     names = list(dict.fromkeys(name for row in plain for name in row))

@@ -19,6 +19,8 @@ def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
     Uses a scrambled Sobol sequence (Owen 1998, J. Complexity 14:466), transformed to the normal
     distribution in filter coordinates.
 
+    InputError if the estimate has not converged or the count is not a power of two.
+
     Parameters
     ----------
     estimate : Estimate
@@ -26,11 +28,6 @@ def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
     count : int
         A power of two balances the sequence.
     seed : int
-
-    Raises
-    ------
-    InputError
-        If the estimate has not converged or the count is not a power of two.
     """
     if not estimate.converged:
         raise InputError(f"no samples: the estimate has not converged: {estimate.reason.value}")
@@ -181,6 +178,8 @@ def predict_scenario(
 ) -> PredictedScenario:
     """Predict a valve under a scenario, with the uncertainty of its estimate.
 
+    InputError if estimate and model do not have the same parameters.
+
     Parameters
     ----------
     model : ClosureModel
@@ -193,11 +192,6 @@ def predict_scenario(
         Called with the number of each finished sample, to show progress.
     finer : ClosureModel, optional
         The same model on a finer mesh, closed once at the estimate, for the mesh error.
-
-    Raises
-    ------
-    InputError
-        If estimate and model do not have the same parameters.
     """
     if estimate.names != model.names:
         raise InputError(

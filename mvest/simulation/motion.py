@@ -203,6 +203,8 @@ def closing_frames(
 
     Pressure and ramp are those of the mechanics' protocol, the steps those of ``settings``.
 
+    RefusedError if the valve does not close.
+
     Returns
     -------
     vertices : list of (n, 3) mm
@@ -210,11 +212,6 @@ def closing_frames(
     tips : list of (2, 3) mm
     model : ClosureModel
         It has been closed with the values of the valve.
-
-    Raises
-    ------
-    RefusedError
-        The valve does not close.
     """
     mesh = structured_mesh(
         drawn.template, settings.element, settings.mesh_columns, settings.mesh_rows

@@ -40,6 +40,8 @@ def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
     plus the standard deviation of the distance of two points with the median ``std_mm`` (nothing if
     that was never measured).
 
+    InputError if the thickness is not a positive number.
+
     Returns
     -------
     list of dict
@@ -48,11 +50,6 @@ def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
         `mvest.valve.measure.clinical`. None stands for what cannot be measured: everything in a
         frame without a valve (confidence 0) or with points that are not finite, and tenting,
         prolapse and billowing of an open valve (`OPEN_SHARE`).
-
-    Raises
-    ------
-    InputError
-        The thickness is not a positive number.
     """
     if not (np.isfinite(thickness_mm) and thickness_mm > 0):
         raise InputError(f"thickness_mm = {thickness_mm}, expected a finite number > 0")

@@ -185,6 +185,9 @@ def trace_cables(
 
     Unlike branches of one trunk, the cables do not restrain each other sideways.
 
+    InputError or GeometryError if a segment has no length or reaches no anchor, or an anchor
+    reaches no leaflet.
+
     Parameters
     ----------
     nodes : (n, 3) mm
@@ -198,11 +201,6 @@ def trace_cables(
     anchor, insertion, length, share : (c,)
         End nodes of each cable; length along the network (mm); axial stiffness of the cable
         relative to that of the chord material, in (0, 1].
-
-    Raises
-    ------
-    InputError, GeometryError
-        A segment has no length or reaches no anchor, or an anchor reaches no leaflet.
     """
     length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     if np.any(length <= 0):

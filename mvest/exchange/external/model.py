@@ -68,6 +68,9 @@ class ProcessModel:
     reason. Each run has its own folder below ``folder``. Converged runs are reused, so an
     interrupted study resumes where it stopped.
 
+    InputError or ConfigurationError if the folder cannot be created, or points, names and units are
+    inconsistent.
+
     Parameters
     ----------
     command : Command
@@ -88,11 +91,6 @@ class ProcessModel:
         run is not reused if any of their contents has changed.
     differences : Differences or None
         How to differentiate if the program does not; None requires it to.
-
-    Raises
-    ------
-    InputError, ConfigurationError
-        The folder cannot be created, or points, names and units are inconsistent.
     """
 
     command: Command

@@ -195,6 +195,9 @@ def joined(
 ) -> tuple[Surface, FloatArray, float]:
     """Join the anterior and posterior leaflets into a band that faces the ventricle.
 
+    GeometryError if the commissures are far from the leaflets, the surfaces are not leaflets, or
+    the band's coordinates fold over.
+
     Parameters
     ----------
     leaflets
@@ -212,12 +215,6 @@ def joined(
 
     Returns the surface with the regions 0 (anterior) and 1 (posterior), the seams, and the largest
     width (mm) of the strips of triangles.
-
-    Raises
-    ------
-    GeometryError
-        The commissures are far from the leaflets, the surfaces are not leaflets, or the band's
-        coordinates fold over.
     """
     for name, leaflet in zip(REGIONS, leaflets, strict=True):
         away = float(_nearest(commissures, leaflet.curve)[0].max())

@@ -123,6 +123,9 @@ class _Seen:
 def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     """Make a case from the leaflets of an open valve, or of an open and a closed valve.
 
+    InputError or GeometryError if a required option is missing (the message names it); leaflets are
+    not recognised, have holes, are in pieces, not closed surfaces, apart, or without an orifice.
+
     Parameters
     ----------
     source : Path
@@ -130,12 +133,6 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
         PLY, OBJ, GLB, VTK). If the file name contains ``anterior``, the other leaflet is read from
         the same name with ``posterior``, and vice versa.
     options : LeafletsOptions
-
-    Raises
-    ------
-    InputError, GeometryError
-        A required option is missing (the message names it); leaflets are not recognised, have
-        holes, are in pieces, not closed surfaces, apart, or without an orifice.
     """
     derived: list[str] = []
     frames: list[FoundFrame] = []

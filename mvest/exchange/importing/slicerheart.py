@@ -96,6 +96,9 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     An open phase becomes the reference and a closed phase the closed frame; another closed phase is
     held out. The leaflets are separate surfaces in the export; they are joined at the commissures.
 
+    InputError or GeometryError if a required option is missing (the message names it), or files are
+    damaged or contradictory.
+
     Parameters
     ----------
     source
@@ -103,11 +106,6 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
         ``AnnulusContourPoints.csv``, ``ValveLandmarkPoints.csv`` and ``*_landmarks.fcsv``;
         papillary muscles are lists of points in files named ``PapillaryMarkup-...``.
     options
-
-    Raises
-    ------
-    InputError, GeometryError
-        A required option is missing (the message names it), or files are damaged or contradictory.
     """
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; expected one that SlicerHeart wrote")

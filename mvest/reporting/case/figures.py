@@ -144,17 +144,14 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
 
     A generic valve is drawn next to it on the same scale.
 
+    InputError if the personalised shape or its distances are missing.
+
     Parameters
     ----------
     fields : CaseFields or Path
         A path is read by `mvest.problem.fields.case_fields`.
     names : sequence of str
         Of the leaflets, written next to them.
-
-    Raises
-    ------
-    InputError
-        If the personalised shape or its distances are missing.
     """
     fields = case_fields(fields) if isinstance(fields, Path) else fields
     if fields.fitted is None or fields.distance_fitted is None:

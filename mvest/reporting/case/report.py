@@ -55,6 +55,8 @@ def report(
 ) -> list[Path]:
     """Write ``unknowns.csv`` and, for an estimate, ``report.html`` with its figures.
 
+    InputError if arrays cannot be read or do not fit the record, or a file cannot be written.
+
     Parameters
     ----------
     result : Personalised or EstimateRecord
@@ -72,11 +74,6 @@ def report(
     -------
     list of Path
         The files, ``unknowns.csv`` first.
-
-    Raises
-    ------
-    InputError
-        If arrays cannot be read or do not fit the record, or a file cannot be written.
     """
     folder = Path(folder)
     try:

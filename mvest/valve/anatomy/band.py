@@ -32,6 +32,9 @@ Located = tuple[IntArray, FloatArray]
 class Band:
     """Material coordinates of a valve.
 
+    GeometryError if the surface is no band, or the leaflets do not meet along as many lines from
+    annulus to free edge, each between two neighbours.
+
     Parameters
     ----------
     valve : Valve
@@ -44,12 +47,6 @@ class Band:
     sections : tuple of int
         The leaflet, an index into ``region_names``, of each section of phi; the first one is 0. The
         leaflets may be named in any order.
-
-    Raises
-    ------
-    GeometryError
-        If the surface is no band, or the leaflets do not meet along as many lines from annulus to
-        free edge, each between two neighbours.
     """
 
     def __init__(self, valve: Valve) -> None:

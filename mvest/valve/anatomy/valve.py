@@ -386,6 +386,8 @@ def sampled_valve(
 ) -> Valve:
     """A valve on a grid of ``columns x rows`` vertices.
 
+    InputError if the numbers are too small or do not divide among the leaflets.
+
     Parameters
     ----------
     shape : MaterialSurface
@@ -395,11 +397,6 @@ def sampled_valve(
     attached : callable
         Angles ``(columns,)`` of the annulus' vertices -> papillary tips ``(t, 3)`` mm, chordae, and
         the motion of annulus and tips.
-
-    Raises
-    ------
-    InputError
-        If the numbers are too small or do not divide among the leaflets.
     """
     sections, leaflets = np.array(shape.sections), len(shape.sections)
     if columns < 8 or columns % leaflets or rows < 3:

@@ -103,6 +103,8 @@ def fields_of_masks(
 ) -> tuple[LeafletFields, FloatArray]:
     """Compute signed distances to sets of voxels.
 
+    GeometryError if a leaflet has no voxels, or the leaflets are too large for the grid.
+
     Parameters
     ----------
     masks
@@ -119,11 +121,6 @@ def fields_of_masks(
         On a finer grid around the leaflets.
     ndarray
         ``(3,)`` position of the grid's first point, in voxels.
-
-    Raises
-    ------
-    GeometryError
-        A leaflet has no voxels, or the leaflets are too large for the grid.
     """
     if not all(mask.any() for mask in masks):
         raise GeometryError("no voxel of a leaflet")
@@ -209,6 +206,9 @@ def thick_leaflets(
 ) -> ThickLeaflets:
     """Make the closed surface of both leaflets: joined at the commissures, cut apart in contact.
 
+    GeometryError if the leaflets do not meet, or the orifice is not their only hole at any of
+    `LEVELS`.
+
     Parameters
     ----------
     fields
@@ -217,11 +217,6 @@ def thick_leaflets(
     seams
         ``(2,)`` mm, `ThickLeaflets.seams` of the open valve. Without it, and with one label for
         both leaflets, the leaflets are one piece wherever they meet.
-
-    Raises
-    ------
-    GeometryError
-        The leaflets do not meet, or the orifice is not their only hole at any of `LEVELS`.
     """
     if len(fields.distance) == 1:
         meet, half = np.zeros(fields.union.shape, dtype=np.bool_), fields.union

@@ -105,6 +105,8 @@ def midsurface(
 ) -> Midsurface:
     """Compute the midsurface of two thick leaflets around one orifice.
 
+    GeometryError if the surface is not a closed thin band, or the leaflets cannot be distinguished.
+
     Parameters
     ----------
     vertices, triangles
@@ -121,11 +123,6 @@ def midsurface(
         Returns the leaflet (0 anterior, 1 posterior) of points ``(k, 3)``, if known.
     edge_mm
         Mean edge length of the triangles.
-
-    Raises
-    ------
-    GeometryError
-        The surface is not a closed thin band, or the leaflets cannot be distinguished.
     """
     first, second = walls(*closed_band(vertices, triangles))
     derived: list[str] = []

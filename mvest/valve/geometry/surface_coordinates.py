@@ -135,18 +135,15 @@ def surface_coordinates(
 ) -> SurfaceCoordinates:
     """Solve for ``theta`` and ``s`` on a band.
 
+    GeometryError if annulus and free edge are not the two boundary loops, a triangle has all
+    corners on one loop, or the coordinates fold over.
+
     Parameters
     ----------
     vertices : (n, 3) mm
     triangles : (m, 3)
     annulus, free_edge : ndarray
         Vertex indices of the two boundary loops, the annulus in loop order.
-
-    Raises
-    ------
-    GeometryError
-        Annulus and free edge are not the two boundary loops, a triangle has all corners on one
-        loop, or the coordinates fold over.
     """
     vertices = np.asarray(vertices, dtype=float)
     loops = boundary_loops(triangles)

@@ -102,18 +102,15 @@ def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> Close
     Vertex ``i`` of the midsurface becomes the vertices ``i`` (ventricular side, along the normal)
     and ``i + n`` (atrial side). Every boundary edge gives two rim triangles.
 
+    GeometryError if the midsurface is invalid, or the thickened surface intersects itself (the
+    thickness exceeds the radius of curvature).
+
     Parameters
     ----------
     surface
         Midsurface with thickness; normals towards the ventricle.
     normals
         ``(n, 3)`` unit offset directions; default `smooth_vertex_normals`.
-
-    Raises
-    ------
-    GeometryError
-        The midsurface is invalid, or the thickened surface intersects itself (the thickness exceeds
-        the radius of curvature).
     """
     check_surface(surface.vertices, surface.triangles, name="midsurface")
     if normals is None:

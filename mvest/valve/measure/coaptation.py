@@ -91,6 +91,9 @@ def project_leaflets(
 ) -> LeafletProjection:
     """Rasterise the leaflets inside the annulus, seen along the annulus normal.
 
+    GeometryError if the pixel size is not positive or so small that the image has more than 50
+    million pixels.
+
     Parameters
     ----------
     vertices, triangles
@@ -101,11 +104,6 @@ def project_leaflets(
         Plane of that annulus; its normal is the line of sight.
     resolution
         Pixel size, mm.
-
-    Raises
-    ------
-    GeometryError
-        Pixel size not positive or so small that the image has more than 50 million pixels.
     """
     if not (np.isfinite(resolution) and resolution > 0):
         raise GeometryError(f"resolution = {resolution} mm; give a positive pixel size")
@@ -339,6 +337,8 @@ def find_gap(
 ) -> Gap:
     """Find the gap of a closed valve; a gap that an overlapping leaflet hides is not counted.
 
+    InputError or GeometryError if the reach is negative or the resolution gives too large an image.
+
     Parameters
     ----------
     vertices, triangles : ndarray
@@ -349,11 +349,6 @@ def find_gap(
         mm, largest distance of two midsurfaces that touch.
     resolution : float
         mm, size of a pixel.
-
-    Raises
-    ------
-    InputError, GeometryError
-        If the reach is negative or the resolution gives too large an image.
     """
     if not (np.isfinite(reach) and reach >= 0):
         raise InputError(f"reach of the contact = {reach} mm, expected >= 0")

@@ -78,6 +78,8 @@ def box(
 ) -> tuple[FloatArray, IntArray]:
     """Nodes ``(n, 3)`` mm and elements ``(m, k)`` of the block ``[0, size]``.
 
+    InputError if the element is unknown, or a size or number of cells is not positive.
+
     Parameters
     ----------
     element_type : str
@@ -86,11 +88,6 @@ def box(
         Cells along x, y and z; z is the thickness.
     size : tuple of float
         mm.
-
-    Raises
-    ------
-    InputError
-        If the element is unknown, or a size or number of cells is not positive.
     """
     if min(cells) < 1 or not min(size) > 0:
         raise InputError(f"box of {cells} cells and size {size} mm, expected all > 0")

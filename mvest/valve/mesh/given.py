@@ -57,6 +57,9 @@ def tetrahedral_leaflets(
     of the nearest midsurface point, projected on its tangent plane. Pressure faces are the outer
     faces nearest to ventricular triangles of the closed surface that face the same way.
 
+    InputError if the element type is neither ``tet4`` nor ``tet10``. MeshingError as
+    `tetrahedralize`, or the area of the pressure faces is not that of the ventricular side.
+
     Parameters
     ----------
     surface
@@ -67,13 +70,6 @@ def tetrahedral_leaflets(
         ``"tet10"`` or ``"tet4"``.
     normals
         Offset directions of `mvest.valve.geometry.thickening.thicken`.
-
-    Raises
-    ------
-    InputError
-        The element type is neither ``tet4`` nor ``tet10``.
-    MeshingError
-        As `tetrahedralize`, or the area of the pressure faces is not that of the ventricular side.
     """
     if element_type not in ("tet4", "tet10"):
         raise InputError(f"element_type {element_type!r}: pytetwild meshes are 'tet4' or 'tet10'")

@@ -113,6 +113,9 @@ def layered_wedges(
 ) -> SolidMesh:
     """Thicken a midsurface into layers of six-node-triangle wedges.
 
+    InputError for an unknown element or fewer than one layer. GeometryError if elements are
+    inverted: the surface bends within its thickness.
+
     Parameters
     ----------
     surface : LeafletSurface
@@ -123,13 +126,6 @@ def layered_wedges(
     element_type : {"wedge12", "wedge18"}
         Linear or quadratic through each layer.
     layers : int
-
-    Raises
-    ------
-    InputError
-        For an unknown element or fewer than one layer.
-    GeometryError
-        If elements are inverted: the surface bends within its thickness.
     """
     if element_type not in LEVELS_PER_LAYER or layers < 1:
         raise InputError(
