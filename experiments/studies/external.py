@@ -4,8 +4,6 @@ A single model is fitted to observed positions. If there are several models, eac
 predictions that some of them make for known parameters.
 """
 
-from __future__ import annotations
-
 import runpy
 import sys
 from dataclasses import dataclass, field, replace
@@ -259,7 +257,7 @@ def check_external(values: Values, folder: Path) -> str:
     )
 
 
-def figure(results: Results) -> Figure | None:
+def figure(results: Results) -> "Figure | None":
     """Iterates of each parameter, for each model."""
     from mvest.reporting.figures import iterates_figure
 
