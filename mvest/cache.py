@@ -103,6 +103,8 @@ def get_or_make(
 
     InputError if the cache cannot be written.
 
+    Returns the values as read from the cache, also if they were just made.
+
     Parameters
     ----------
     entries : sequence of Entry
@@ -112,11 +114,6 @@ def get_or_make(
         Writes a value to a path, as a file or as a folder.
     keep : callable
         Whether a value is cached; otherwise it is returned unchanged.
-
-    Returns
-    -------
-    list
-        Values as read from the cache, also if they were just made.
     """
     values: list[Any] = [entry.found() for entry in entries]
     left = [k for k, value in enumerate(values) if value is None]

@@ -24,7 +24,7 @@ def write_atomically(
     An existing one is replaced. Interruptions leave no partial content, and other processes see
     none.
 
-    InputError if it cannot be written.
+    Returns ``path``. InputError if it cannot be written.
 
     Parameters
     ----------
@@ -35,11 +35,6 @@ def write_atomically(
         which ends as ``path`` does, and makes a file or a folder there.
     sync : bool
         Whether to flush the content to the disk before renaming.
-
-    Returns
-    -------
-    Path
-        ``path``.
     """
     target = Path(path)
     part = target.with_name(f"{PREFIX}{uuid.uuid4().hex}-{target.name}")

@@ -30,16 +30,14 @@ THREAD_VARIABLES = (
 def provenance(directory: Path | None = None) -> dict[str, Any]:
     """Describe the code and the machine of a computation.
 
+    Returns a dict: ``git`` (see `git_state`), ``versions`` of packages and ``threads`` by
+    environment variable (None if not installed or unset), ``python``, ``platform``, ``machine`` and
+    ``cpu_count``.
+
     Parameters
     ----------
     directory : Path, optional
         A folder of the checkout; by default that of this file.
-
-    Returns
-    -------
-    dict
-        ``git`` (see `git_state`), ``versions`` of packages and ``threads`` by environment variable
-        (None if not installed or unset), ``python``, ``platform``, ``machine`` and ``cpu_count``.
     """
     versions: dict[str, str | None] = dict.fromkeys(KEY_PACKAGES)
     for name in KEY_PACKAGES:
@@ -59,12 +57,9 @@ def provenance(directory: Path | None = None) -> dict[str, Any]:
 def git_state(directory: Path) -> dict[str, Any]:
     """The commit of a folder, and whether its tracked files differ from it.
 
-    Returns
-    -------
-    dict
-        ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file outside ``results/``
-        was changed). Both are None without git, without a commit, or without tracked files in the
-        folder.
+    Returns a dict: ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file outside
+    ``results/`` was changed). Both are None without git, without a commit, or without tracked files
+    in the folder.
     """
     sha = _git(directory, "rev-parse", "--verify", "HEAD")
     # An installation within somebody's checkout does not belong to it.

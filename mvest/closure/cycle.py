@@ -188,20 +188,17 @@ def compare_time_steps(
 
     InputError if a step is not half of the one before.
 
+    Returns a list of dicts: one for each time step ``dt`` (s): ``change`` (mm, root mean square
+    over all frames) when the step is halved; its ``order``, the binary logarithm of the ratio of
+    two such changes; ``unevenness``, the largest over the median change along the path, large if
+    frames jump; and the ``reason`` why the path ended early. Unknown numbers are None.
+
     Parameters
     ----------
     model : CycleModel
     dts : sequence of float
         s, each half of the one before.
     path : (n, p)
-
-    Returns
-    -------
-    list of dict
-        One for each time step ``dt`` (s): ``change`` (mm, root mean square over all frames) when
-        the step is halved; its ``order``, the binary logarithm of the ratio of two such changes;
-        ``unevenness``, the largest over the median change along the path, large if frames jump; and
-        the ``reason`` why the path ended early. Unknown numbers are None.
     """
     if any(not np.isclose(b, 0.5 * a) for a, b in pairwise(dts)):
         raise InputError(f"time steps {list(dts)} s, expected each to be half of the one before")

@@ -107,7 +107,8 @@ def simulate(
 ) -> Simulation:
     """Integrate ``system`` over ``steps``.
 
-    InputError if the steps are not increasing.
+    Returns the completed frames, and the reason for the end. InputError if the steps are not
+    increasing.
 
     Parameters
     ----------
@@ -134,11 +135,6 @@ def simulate(
         s.
     on_step : callable, optional
         Called with (time, Newton iterations so far) after each step, for progress.
-
-    Returns
-    -------
-    Simulation
-        Holds the completed frames, and the reason for the end.
     """
     damping = damping or Damping()
     newton = newton or NewtonSettings()

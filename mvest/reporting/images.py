@@ -176,10 +176,7 @@ def _across(direction: FloatArray, axis: FloatArray) -> FloatArray:
 def resample(volume: VolumeSequence, frame: int, plane: SlicePlane, extent: Extent) -> FloatArray:
     """A trilinearly interpolated slice of one frame.
 
-    Returns
-    -------
-    (rows, columns)
-        Pixels of `STEP_MM` from the bottom up; NaN outside the volume.
+    Returns ``(rows, columns)`` pixels of `STEP_MM` from the bottom up; NaN outside the volume.
     """
     across, up = (
         low + (np.arange(round((high - low) / STEP_MM)) + 0.5) * STEP_MM

@@ -72,12 +72,9 @@ class PredictedScenario:
     def spread(self, name: str) -> dict[str, float]:
         """Statistics of a measure over the samples that did not fail.
 
-        Returns
-        -------
-        dict
-            ``mean`` and ``std``; ``low`` and ``high``, the 2.5 and 97.5 % quantiles (Hyndman and
-            Fan 1996, Am. Stat. 50:361, type 8), close to the extremes with fewer than 40 samples;
-            and the number of finite ``samples``. NaN if these are too few.
+        Returns a dict: ``mean`` and ``std``; ``low`` and ``high``, the 2.5 and 97.5 % quantiles
+        (Hyndman and Fan 1996, Am. Stat. 50:361, type 8), close to the extremes with fewer than 40
+        samples; and the number of finite ``samples``. NaN if these are too few.
         """
         known = np.array([v for v in (one.get(name) for one in self.samples) if np.isfinite(v)])
         mean = float(known.mean()) if len(known) else float("nan")
@@ -115,17 +112,14 @@ class PredictedScenario:
     def against(self, own: Sample, same: Sample) -> dict[str, dict[str, float | bool | None]]:
         """Compare every measure with that of the true valve.
 
+        Returns a dict: measure -> its ``estimate``, `spread`, ``mesh_error``, the ``wide_``
+        `interval` with it, both truths, and whether the intervals contain them; None if unknown.
+
         Parameters
         ----------
         own, same : Sample
             The true parameters' valve on its own mesh, and on the estimator's mesh, where only the
             parameters are uncertain.
-
-        Returns
-        -------
-        dict
-            Measure -> its ``estimate``, `spread`, ``mesh_error``, the ``wide_`` `interval` with it,
-            both truths, and whether the intervals contain them; None if unknown.
         """
 
         def inside(interval: tuple[float, float], true: float | None) -> bool | None:

@@ -42,14 +42,11 @@ def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
 
     InputError if the thickness is not a positive number.
 
-    Returns
-    -------
-    list of dict
-        The same names for each frame: ``frame`` (from 0), ``time_s``, ``confidence`` (0 to 1),
-        ``vertex_confidence_mean``, ``contact_distance_mm`` and those of
-        `mvest.valve.measure.clinical`. None stands for what cannot be measured: everything in a
-        frame without a valve (confidence 0) or with points that are not finite, and tenting,
-        prolapse and billowing of an open valve (`OPEN_SHARE`).
+    Returns the same names for each frame: ``frame`` (from 0), ``time_s``,
+    ``confidence`` (0 to 1), ``vertex_confidence_mean``, ``contact_distance_mm`` and those of
+    `mvest.valve.measure.clinical`. None stands for what cannot be measured: everything in a frame
+    without a valve (confidence 0) or with points that are not finite, and tenting, prolapse and
+    billowing of an open valve (`OPEN_SHARE`).
     """
     if not (np.isfinite(thickness_mm) and thickness_mm > 0):
         raise InputError(f"thickness_mm = {thickness_mm}, expected a finite number > 0")

@@ -57,6 +57,8 @@ def report(
 
     InputError if arrays cannot be read or do not fit the record, or a file cannot be written.
 
+    Returns the files, ``unknowns.csv`` first.
+
     Parameters
     ----------
     result : Personalised or EstimateRecord
@@ -69,11 +71,6 @@ def report(
         Where the record came from, for the foot of each picture.
     provenance : mapping, optional
         The same in full, for the end of the page.
-
-    Returns
-    -------
-    list of Path
-        The files, ``unknowns.csv`` first.
     """
     folder = Path(folder)
     try:
