@@ -34,10 +34,7 @@ def provenance(directory: Path | None = None) -> dict[str, Any]:
     environment variable (None if not installed or unset), ``python``, ``platform``, ``machine`` and
     ``cpu_count``.
 
-    Parameters
-    ----------
-    directory : Path, optional
-        A folder of the checkout; by default that of this file.
+    ``directory``: a folder of the checkout; by default that of this file.
     """
     versions: dict[str, str | None] = dict.fromkeys(KEY_PACKAGES)
     for name in KEY_PACKAGES:

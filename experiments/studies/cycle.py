@@ -162,7 +162,7 @@ def _estimates(
                 # The error of the estimator's mesh follows from one run on a third mesh.
                 finer = _on_mesh(values, settings, settings.check)
                 try:
-                    wider, _, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
+                    wider, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
                 except InputError as error:
                     numbers["check_mesh"] = str(error)
                     continue

@@ -90,10 +90,7 @@ class Settings:
 
 
 def problem_of(about: ExternalSettings, values: Values) -> Problem:
-    """The problem, with a placeholder model.
-
-    MvestError if a setting is missing or inadmissible.
-    """
+    """The problem, with a placeholder model. MvestError if a setting is missing or inadmissible."""
     names = tuple(values["parameters"])
     for key, instead in (("P0", "external.prior_std"), ("R", "external.noise_mm")):
         if values["filter"][key] is not None:

@@ -228,10 +228,11 @@ def _rms(values: FloatArray) -> float:
 
 def with_mesh_error(
     found: Estimate, R: NoiseCovariance, other: CycleModel
-) -> tuple[Estimate, FloatArray, float]:
+) -> tuple[Estimate, float]:
     """Add the mesh error to the covariance of an estimate from a whole cycle.
 
-    InputError if there is no prediction, or no cycle on the other mesh.
+    Also returns the mean distance (mm) between the frames of the two meshes. InputError if there is
+    no prediction, or no cycle on the other mesh.
 
     Parameters
     ----------
@@ -241,19 +242,10 @@ def with_mesh_error(
         Of the observation.
     other : CycleModel
         The same cycle on a finer mesh; it is run once.
-
-    Returns
-    -------
-    Estimate
-    ndarray, (p,)
-        Shift due to the mesh, in units of the parameters.
-    float
-        mm, mean distance between the frames of the two meshes.
     """
     frames = other.frames(found.mean)
     if found.prediction is None:
         raise InputError("an estimate without a prediction has no derivatives")
     off = frames - found.prediction.y.reshape(frames.shape)
     shift = shift_by_model_error(found, R, off.ravel())
-    moved = shift * found.transform.derivative(found.transformed.mean)
-    return with_shift(found, shift), moved, float(np.linalg.norm(off, axis=-1).mean())
+    return with_shift(found, shift), float(np.linalg.norm(off, axis=-1).mean())

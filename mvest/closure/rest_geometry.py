@@ -179,10 +179,7 @@ class RestGeometry:
 
         GeometryError if a leaflet would have no thickness, or a chord no length.
 
-        Parameters
-        ----------
-        parts : mapping
-            Some of `PARTS` -> one quantity each, where `variation` takes several.
+        ``parts``: some of `PARTS` -> one quantity each, where `variation` takes several.
         """
         own = {name: np.asarray(values)[None] for name, values in parts.items()}
         model, nodes = self.model, np.zeros_like(self.model.mesh.nodes)

@@ -127,10 +127,7 @@ def _write(stream: Any, tree: Any) -> None:
 
 
 def _read(stream: Any) -> Any:
-    """Read a tree written by `_write`.
-
-    EOFError if the stream ended.
-    """
+    """Read a tree written by `_write`. EOFError if the stream ended."""
 
     def exactly(size: int) -> np.ndarray:
         content = np.empty(size, dtype=np.uint8)

@@ -211,11 +211,7 @@ class EdgeRotations:
 
     InputError if the elements are not linear tetrahedra.
 
-    Parameters
-    ----------
-    mesh : SolidMesh
-    frames : ndarray
-        ``(e, 1, 3, 3)`` fibre frames, columns as in :mod:`mvest.mechanics.solid`.
+    ``frames``: ``(e, 1, 3, 3)`` fibre frames, columns as in :mod:`mvest.mechanics.solid`.
     """
 
     def __init__(self, mesh: SolidMesh, frames: FloatArray) -> None:

@@ -247,10 +247,7 @@ class SurfaceObservation:
 
         ``aux`` of a prediction are the observed frames with all vertices, (f, n, 3) mm.
 
-        Parameters
-        ----------
-        model : ObservationModel
-            Predicts the stacked positions ``(3 n f,)`` mm of all frames of ``predicted``.
+        ``model``: predicts the stacked positions ``(3 n f,)`` mm of all frames of ``predicted``.
         """
         observed, n = observed_frames(model, self.frames, None, self.predicted), self.surface.size
 

@@ -206,10 +206,8 @@ def rest_lengths_by_ends(
     A closed frame without correspondence does not show the insertions, so the open frame replaces
     it. None if rest lengths were stated.
 
-    Parameters
-    ----------
-    open_moves, closed_moves : (q, c, 3) mm
-        Displacement of the insertion of each chord relative to its tip in these frames.
+    ``open_moves, closed_moves`` ``(q, c, 3) mm``: displacement of the insertion of each chord
+    relative to its tip in these frames.
     """
     if not case.chordae_follow:
         return None

@@ -57,10 +57,7 @@ def build_model(
     InputError if an unknown is not one of the case's, or a modulus is missing. GeometryError or
     MeshingError if the leaflets cannot be meshed.
 
-    Parameters
-    ----------
-    store : Path, optional
-        Folder in which an unstructured mesh is cached.
+    ``store``: folder in which an unstructured mesh is cached.
     """
     coarse = build_coarse(case, settings, store)
     solid = _solid(GivenValve(case.valve), settings.mesh, store)

@@ -91,10 +91,7 @@ class Check:
 def judge(seen: Mapping[str, Found]) -> Verdict:
     """The verdict on an estimate.
 
-    Parameters
-    ----------
-    seen : mapping
-        Key of `CHECKS` -> what was found. Checks without a key count as missing.
+    ``seen``: key of `CHECKS` -> what was found. Checks without a key count as missing.
     """
     failed_checks: list[FailedCheck] = []
     missing: list[str] = []

@@ -81,11 +81,7 @@ def unknown_text(title: str, reason: str) -> str:
 def trade_off_text(group: TradeOff, labels: Mapping[str, str] | None = None) -> str:
     """One sentence about parameters that the data hardly distinguish.
 
-    Parameters
-    ----------
-    group : TradeOff
-    labels : mapping, optional
-        Labels of the parameters.
+    ``labels``: labels of the parameters.
     """
     labelled = [(labels or {}).get(name, name) for name in group.parameters]
     moved = []

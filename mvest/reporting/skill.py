@@ -46,10 +46,7 @@ def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
     ``relative width`` is the median over the estimate, and ``width over prior`` the median ratio of
     logarithmic widths. None: not known.
 
-    Parameters
-    ----------
-    unknowns : sequence of Unknown
-        At least one, of one kind, with their truths; of one valve or of many.
+    ``unknowns``: at least one, of one kind, with their truths; of one valve or of many.
     """
     unit = "" if unknowns[0].is_modulus else unknowns[0].unit
     prior = [prior_alone(own) for own in unknowns]
@@ -221,10 +218,7 @@ def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> "Figur
 
     Each modulus has a panel, and each group a band in which truths rise downwards.
 
-    Parameters
-    ----------
-    groups : mapping
-        Name -> moduli with known truths, each with its verdict in a word.
+    ``groups``: name -> moduli with known truths, each with its verdict in a word.
     """
     from mvest.reporting.figures import panels
 

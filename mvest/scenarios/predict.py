@@ -115,11 +115,8 @@ class PredictedScenario:
         Returns a dict: measure -> its ``estimate``, `spread`, ``mesh_error``, the ``wide_``
         `interval` with it, both truths, and whether the intervals contain them; None if unknown.
 
-        Parameters
-        ----------
-        own, same : Sample
-            The true parameters' valve on its own mesh, and on the estimator's mesh, where only the
-            parameters are uncertain.
+        ``own, same``: the true parameters' valve on its own mesh, and on the estimator's mesh,
+        where only the parameters are uncertain.
         """
 
         def inside(interval: tuple[float, float], true: float | None) -> bool | None:

@@ -106,10 +106,7 @@ class Deck:
         return np.array(sorted(held), dtype=np.int64)
 
     def members(self, kind: str, name: str) -> IntArray:
-        """Members of a set (NSET or ELSET), as numbers.
-
-        InputError if there is no such set.
-        """
+        """Members of a set (NSET or ELSET), as numbers. InputError if there is no such set."""
         what = {"NSET": "node set", "ELSET": "element set"}[kind]
         members: IntArray = self._known(self.sets[kind], name, what)
         return members

@@ -126,13 +126,9 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     InputError or GeometryError if a required option is missing (the message names it); leaflets are
     not recognised, have holes, are in pieces, not closed surfaces, apart, or without an orifice.
 
-    Parameters
-    ----------
-    source : Path
-        Label map (NRRD, ``.seg.nrrd``, NIfTI, MetaImage; converted to LPS) or closed surfaces (STL,
-        PLY, OBJ, GLB, VTK). If the file name contains ``anterior``, the other leaflet is read from
-        the same name with ``posterior``, and vice versa.
-    options : LeafletsOptions
+    ``source``: label map (NRRD, ``.seg.nrrd``, NIfTI, MetaImage; converted to LPS) or closed
+    surfaces (STL, PLY, OBJ, GLB, VTK). If the file name contains ``anterior``, the other leaflet is
+    read from the same name with ``posterior``, and vice versa.
     """
     derived: list[str] = []
     frames: list[FoundFrame] = []

@@ -99,13 +99,9 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     InputError or GeometryError if a required option is missing (the message names it), or files are
     damaged or contradictory.
 
-    Parameters
-    ----------
-    source
-        The folder of one scene, with ``*_atrial_*.vtk`` and, if exported,
-        ``AnnulusContourPoints.csv``, ``ValveLandmarkPoints.csv`` and ``*_landmarks.fcsv``;
-        papillary muscles are lists of points in files named ``PapillaryMarkup-...``.
-    options
+    ``source``: the folder of one scene, with ``*_atrial_*.vtk`` and, if exported,
+    ``AnnulusContourPoints.csv``, ``ValveLandmarkPoints.csv`` and ``*_landmarks.fcsv``; papillary
+    muscles are lists of points in files named ``PapillaryMarkup-...``.
     """
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; expected one that SlicerHeart wrote")

@@ -93,11 +93,8 @@ def _views_figure(
 def frames_figure(case: "ValveCase", reach_mm: float) -> Figure:
     """The frames of a case as given, from two sides.
 
-    Parameters
-    ----------
-    case : ValveCase
-    reach_mm : float
-        Distance of midsurfaces within which leaflets touch. The closed frame shows its gap.
+    ``reach_mm``: distance of midsurfaces within which leaflets touch. The closed frame shows its
+    gap.
     """
     # Figures of a synthetic valve do not need what this imports.
     from mvest.cases.case import Role

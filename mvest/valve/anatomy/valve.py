@@ -253,10 +253,8 @@ class Chordae:
         A junction moves with its tip and the mean of the leaflet ends beyond it, each weighted by
         the length of the chord on the other side.
 
-        Parameters
-        ----------
-        tips, ends : (t, 3) and (c, 3) mm
-            Displacements of the papillary tips and of the insertions.
+        ``tips, ends`` ``(t, 3) and (c, 3) mm``: displacements of the papillary tips and of the
+        insertions.
         """
         weights = leverage(self.parent, self.rest_length, len(self.insertion))
         held = (1 - weights.sum(axis=1, keepdims=True)) * tips[self.tip[len(self.insertion) :]]

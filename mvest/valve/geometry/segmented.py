@@ -166,11 +166,7 @@ def check_tips_of(surface: Midsurface, tips: FloatArray) -> None:
 
     GeometryError if a tip is farther than `MAX_AWAY` from the leaflets.
 
-    Parameters
-    ----------
-    surface
-    tips
-        ``(2, 3)`` mm, LPS, antero-lateral tip first.
+    ``tips``: ``(2, 3)`` mm, LPS, antero-lateral tip first.
     """
     centre = surface.vertices.mean(axis=0)
     away, turned = (

@@ -26,10 +26,7 @@ class GivenValve(Band):
     """An imported valve in any resolution, and its meshes in layers."""
 
     def layers(self, element: str, columns: int, rows: int, layers: int = 1) -> SolidMesh:
-        """A mesh of ``columns x rows x layers`` cells.
-
-        GeometryError if cells are folded.
-        """
+        """A mesh of ``columns x rows x layers`` cells. GeometryError if cells are folded."""
         try:
             return structured_mesh(self, element, columns, rows, layers)
         except GeometryError as fault:
