@@ -4,8 +4,6 @@ All results come from one simulated cycle of a valve with known parameters. The 
 `joint`, `joint_open` and `chord` differ in their unknowns and estimates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -77,10 +75,7 @@ along the path that tests frames for jumps."""
 def run_cycle(job: Job[Settings]) -> Result:
     """Simulate a cycle, compute the bounds of its frames, and make the configured estimates.
 
-    Raises
-    ------
-    InputError
-        If the true cycle fails on one of the meshes, or a setting is inadmissible.
+    InputError if the true cycle fails on one of the meshes, or a setting is inadmissible.
     """
     values, settings = job.values, job.settings.cycle
     truth = np.array(values["truth"]["values"], dtype=float)
@@ -167,7 +162,7 @@ def _estimates(
                 # The error of the estimator's mesh follows from one run on a third mesh.
                 finer = _on_mesh(values, settings, settings.check)
                 try:
-                    wider, _, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
+                    wider, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
                 except InputError as error:
                     numbers["check_mesh"] = str(error)
                     continue
@@ -224,7 +219,7 @@ def expect_cycle(values: Values, _folder: Path | None = None) -> str:
         return expectation_text(f"{values['name']}, {values['row']}", problem, seen, noise)
 
 
-def figure(results: Results) -> Figure:
+def figure(results: Results) -> "Figure":
     """Bounds for sets of frames, and the errors of estimates if there are any."""
     from mvest.reporting.figures import COLOURS, MARKERS, SMALL, log_axis, panels
 

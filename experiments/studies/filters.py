@@ -1,7 +1,5 @@
 """Runs all filters on the same problems and compares them with draws from the posterior."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -70,10 +68,7 @@ class Settings:
 def run(job: Job[Settings]) -> Result:
     """Run every filter on every problem.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible, or the reference gives no draws.
+    MvestError if a setting is inadmissible, or the reference gives no draws.
     """
     settings, seed = job.settings.filters, job.values["seed"]
     rows: list[dict[str, Any]] = []
@@ -208,7 +203,7 @@ def build_problem(config: Values, name: str, about: FilterProblem) -> Problem:
     return Problem(name, about, twin.model, model, prior)
 
 
-def figure(results: Results) -> Figure:
+def figure(results: Results) -> "Figure":
     """The 95 % intervals of each filter relative to those of the reference."""
     from textwrap import fill
 

@@ -5,8 +5,6 @@ closes the shape of a reference heart (``heart``), and estimates known moduli on
 not part of this project; ``conf/experiment`` names their sources.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from copy import copy
@@ -136,10 +134,8 @@ class Settings:
 def run(job: Job[Settings]) -> Result:
     """Fit the recorded donor valve, or close, gate and estimate the reference heart.
 
-    Raises
-    ------
-    MvestError
-        If the data are missing (the message names their source) or a setting is inadmissible.
+    MvestError if the data are missing (the message names their source) or a setting is
+    inadmissible.
     """
     return _donor(job) if job.settings.donor.case else _heart(job)
 
@@ -179,10 +175,7 @@ DISTANCES = ("mean", "max", "surface")
 def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
     """Read, mesh and load the recorded valve as configured.
 
-    Raises
-    ------
-    MvestError
-        If the data are missing or a setting is inadmissible.
+    MvestError if the data are missing or a setting is inadmissible.
     """
     names = donor.leaflets, donor.annulus, donor.free_edge
     recording = read_recording(recording_folder(donor.recording, donor.case), *names)
@@ -286,10 +279,8 @@ def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]
 def import_heart(heart: HeartSettings) -> ValveCase:
     """Make a case of the valve's open frame.
 
-    Raises
-    ------
-    InputError, GeometryError
-        A part is missing, or does not fit a thick valve with two muscles.
+    InputError or GeometryError if a part is missing, or does not fit a thick valve with two
+    muscles.
     """
     for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
         if file is None or not Path(file).is_file():
@@ -357,7 +348,7 @@ def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:
     return record_of(found, seed=values["seed"], case=name, simulated=True)
 
 
-def figure(results: Results) -> Figure | None:
+def figure(results: Results) -> "Figure | None":
     """The closed donor valve with generic and fitted moduli, or the heart valve open and closed."""
     from matplotlib.figure import Figure
 

@@ -10,8 +10,6 @@ the share of the arc length between the commissures, on the annulus (s = 0) and 
 = 1). Between the two, the harmonic angle of a phi is linear in s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,13 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mvest.cases.band import (
-    arc_shares,
-    check_thickness,
-    commissures,
-    directed,
-    loop_vector_area,
-)
+from mvest.cases.band import arc_shares, check_thickness, commissures, directed, loop_vector_area
 from mvest.cases.case import Frame, Role
 from mvest.cases.frames import MM_PER, CheckedFrame, SeenFrame
 from mvest.cases.schema import CaseFolder, PointData
@@ -304,7 +296,7 @@ class LeafletBand:
         annulus: IntArray,
         free_edge: IntArray,
         anterior: int,
-    ) -> LeafletBand:
+    ) -> "LeafletBand":
         """Solve for the coordinates of a band; ``anterior`` is the number of that leaflet.
 
         GeometryError if the coordinates fold over, or a leaflet does not meet the annulus or the

@@ -3,8 +3,6 @@
 ``ClosureModel`` predicts the observed vertices from the parameters of valve and mechanics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -86,7 +84,7 @@ class ClosureModel:
     #: the same valve and parameters on a coarser mesh. A closure that would start from the open
     #: valve is computed there first; its closed state is the starting point for the equilibrium on
     #: this mesh. A guide may have a guide.
-    guide: ClosureModel | None = None
+    guide: "ClosureModel | None" = None
     #: whether a failed continued closure is repeated with the guide, and then from the open valve,
     #: which takes long and seldom succeeds
     repeat: bool = True
@@ -122,7 +120,7 @@ class ClosureModel:
                 f"model: {', '.join(self.names)}"
             )
 
-    def fresh(self) -> ClosureModel:
+    def fresh(self) -> "ClosureModel":
         """A copy that has built and closed nothing yet, without a progress callback."""
         guide = None if self.guide is None else self.guide.fresh()
         return replace(self, guide=guide, on_step=None)
@@ -161,10 +159,7 @@ class ClosureModel:
 
         The system is built once and belongs to the model.
 
-        Raises
-        ------
-        MaterialError
-            If a modulus is inadmissible.
+        MaterialError if a modulus is inadmissible.
         """
         values = self._values(m)
         if self._system is None:
@@ -201,7 +196,7 @@ class ClosureModel:
         self.relaxed = plain.settings, self.mesh, green
         return green
 
-    def _linear(self, relaxation: Relaxation) -> ClosureModel:
+    def _linear(self, relaxation: Relaxation) -> "ClosureModel":
         """The same valve with linear tissue that is free of stress when open."""
         tissue = self.settings.tissue.items()
         settings = replace(
@@ -258,6 +253,8 @@ class ClosureModel:
     ) -> ClosureResult:
         """Run the closure with parameters ``m (p,)``.
 
+        MaterialError if a modulus is inadmissible.
+
         Parameters
         ----------
         m : ndarray
@@ -266,11 +263,6 @@ class ClosureModel:
         every_frame : bool
             Whether all frames are needed, not only the last. They are then solved to the full
             tolerance, and the closure starts from the open valve.
-
-        Raises
-        ------
-        MaterialError
-            If a modulus is inadmissible.
         """
         if every_frame:
             return self._close(m, sensitivities, every_frame=True)
@@ -384,6 +376,9 @@ class ClosureModel:
     ) -> list[Simulation]:
         """Compute the closure, then one equilibrium after another until one fails.
 
+        InputError if a state's annulus or tips are not those of the valve. MaterialError if a
+        modulus is inadmissible.
+
         Parameters
         ----------
         m : (p,)
@@ -394,13 +389,6 @@ class ClosureModel:
         start : (n, 3) mm, optional
             Nodal positions, for example of a closed valve of other tissue, that are brought to rest
             under the final loads to find the closed state.
-
-        Raises
-        ------
-        InputError
-            If a state's annulus or tips are not those of the valve.
-        MaterialError
-            If a modulus is inadmissible.
         """
         system, parameters = self.tuned(m)
         if not sensitivities:

@@ -5,8 +5,6 @@ on the surface and its fraction of the thickness. Embeddings do not change, so t
 points are observed, touch and are held.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -38,18 +36,15 @@ PARTS = ("shape", "thickness", "fibres", "annulus", "tips", "rest_lengths", "ins
 class RestGeometry:
     """The rest geometry of a closing valve, and the closed state's dependence on it.
 
+    InputError if the protocol does not end in equilibrium: a moving valve has a history, which also
+    depends on the geometry.
+
     Parameters
     ----------
     model : ClosureModel
         Its protocol must end in an equilibrium.
     seen : ClosureModel, optional
         The undisplaced model, if changes are measured from it.
-
-    Raises
-    ------
-    InputError
-        If the protocol does not end in equilibrium: a moving valve has a history, which also
-        depends on the geometry.
     """
 
     def __init__(self, model: ClosureModel, seen: ClosureModel | None = None) -> None:
@@ -182,15 +177,9 @@ class RestGeometry:
         its derivative predicts. Junctions of the chordae stay: their place at rest only matters
         while they are slack.
 
-        Parameters
-        ----------
-        parts : mapping
-            Some of `PARTS` -> one quantity each, where `variation` takes several.
+        GeometryError if a leaflet would have no thickness, or a chord no length.
 
-        Raises
-        ------
-        GeometryError
-            If a leaflet would have no thickness, or a chord no length.
+        ``parts``: some of `PARTS` -> one quantity each, where `variation` takes several.
         """
         own = {name: np.asarray(values)[None] for name, values in parts.items()}
         model, nodes = self.model, np.zeros_like(self.model.mesh.nodes)

@@ -25,8 +25,6 @@ the limit; a derivative that is wrong only at an end of the path; and whether a 
 the resolution is continuous, which does not affect an estimate of that modulus.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -61,29 +59,19 @@ class PathState:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """The part of a path between two neighbouring states.
+    """The part of a path between two neighbouring states."""
 
-    Attributes
-    ----------
-    low, high : float
-        Factors on the moduli.
-    unexplained_mm : float
-        Largest unexplained motion of a vertex.
-    vertices : int
-        Number of vertices that exceed `JUMP_LIMIT`.
-    unexplained, way : float
-        mm, unexplained motion and whole motion by the derivatives; norms over all vertices.
-    """
-
+    #: factors on the moduli
     low: float
     high: float
-    unexplained_mm: float
-    vertices: int
+    unexplained_mm: float  #: largest unexplained motion of a vertex
+    vertices: int  #: number of vertices that exceed `JUMP_LIMIT`
+    #: mm, unexplained motion and whole motion by the derivatives; norms over all vertices
     unexplained: float
     way: float
 
     @classmethod
-    def between(cls, low: float, high: float, states: Mapping[float, PathState]) -> Piece:
+    def between(cls, low: float, high: float, states: Mapping[float, PathState]) -> "Piece":
         """The piece between the states at two factors."""
         a, b, width = states[low], states[high], np.log(high / low)
         unexplained = b.y - a.y - 0.5 * width * (a.slope + b.slope)

@@ -4,8 +4,6 @@ Rules and defaults follow the JSON schema ``markups-schema-v1.0.3.json`` of Slic
 and its reader ``vtkMRMLMarkupsJsonStorageNode``. Positions here are LPS in mm.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -44,7 +42,7 @@ class PointList:
     unplaced: tuple[str, ...] = ()  # labels of listed points without a position
 
     @classmethod
-    def numbered(cls, name: str, points: FloatArray, kind: str = "Fiducial") -> PointList:
+    def numbered(cls, name: str, points: FloatArray, kind: str = "Fiducial") -> "PointList":
         """Points ``(n, 3)`` labelled ``name-1``, ``name-2``, ..."""
         return cls(tuple(f"{name}-{i + 1}" for i in range(len(points))), points, kind)
 
@@ -52,10 +50,8 @@ class PointList:
 def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
     """Write lists of points and curves, by name, to a ``.mrk.json`` file.
 
-    Raises
-    ------
-    InputError
-        The suffix differs, there are no lists, a position is not finite, or writing fails.
+    InputError if the suffix differs, there are no lists, a position is not finite, or writing
+    fails.
     """
     target = Path(path)
     if not target.name.endswith(".mrk.json") or not lists:
@@ -81,11 +77,8 @@ def read_markups(path: Path | str) -> dict[str, PointList]:
     A list without a name is named after the file, as in Slicer. Points without a position go to
     `PointList.unplaced`.
 
-    Raises
-    ------
-    InputError
-        The file is missing, has neither format, or has an unknown coordinate system or length unit,
-        or a placed point without three numbers.
+    InputError if the file is missing, has neither format, or has an unknown coordinate system or
+    length unit, or a placed point without three numbers.
     """
     source = Path(path)
     if source.suffix.lower() == ".fcsv":

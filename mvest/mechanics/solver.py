@@ -1,7 +1,5 @@
 """Sparse direct solvers: PARDISO (Intel MKL, x86-64 only) if installed, or SciPy's SuperLU."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys
@@ -149,7 +147,7 @@ class PardisoSolver:
             self._pardiso.analyse(self._factor, 0 if pattern.n < NESTED_FROM else 2)
         self._pardiso.factorize()
 
-    def _substitute(self, matrix: BlockMatrix) -> SuperLUSolver:
+    def _substitute(self, matrix: BlockMatrix) -> "SuperLUSolver":
         self._whole = SuperLUSolver()
         self._whole.factorize(matrix)
         self._substituted += 1
@@ -220,7 +218,7 @@ class _Pardiso:
         """Whether the factor is of single precision."""
         return bool(self.settings[27])
 
-    def analyse(self, blocks: _Blocks, ordering: int) -> None:
+    def analyse(self, blocks: "_Blocks", ordering: int) -> None:
         """Symbolic analysis; numeric factorisations read the same arrays."""
         self._blocks = blocks
         self.settings[1] = ordering
@@ -272,7 +270,7 @@ class _Pardiso:
         return np.asarray(out, dtype=np.float64)
 
 
-def _pointer(array: NDArray[Any], kind: type[ctypes._SimpleCData[Any]] | None = None) -> Any:
+def _pointer(array: NDArray[Any], kind: "type[ctypes._SimpleCData[Any]] | None" = None) -> Any:
     """Address of the array."""
     if kind is None:
         return ctypes.c_void_p(array.ctypes.data)
@@ -304,7 +302,7 @@ class _Blocks:
     @classmethod
     def of(
         cls, pattern: SparsityPattern, kept: BoolArray, precision: type[np.floating[Any]]
-    ) -> _Blocks:
+    ) -> "_Blocks":
         """The blocks marked in ``kept (u,)``, without their entries."""
         here = np.flatnonzero(kept)
         pointer = np.searchsorted(here, pattern.pointer).astype(np.int32) + 1
@@ -369,10 +367,7 @@ class SuperLUSolver:
 def linear_solver(name: str = "auto") -> LinearSolver:
     """The solver ``pardiso``, ``superlu`` or ``auto`` (PARDISO if installed).
 
-    Raises
-    ------
-    InputError
-        If the name is unknown, or PARDISO is requested and not installed.
+    InputError if the name is unknown, or PARDISO is requested and not installed.
     """
     if name not in ("auto", "pardiso", "superlu"):
         raise InputError(f"unknown linear solver {name!r}; known: auto, pardiso, superlu")

@@ -25,8 +25,6 @@ Limits:
 * Points must lie on what the model predicts, the midsurface of the leaflets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -52,10 +50,7 @@ UNKNOWN = -1
 class ObservedSurface:
     """One frame seen without correspondence.
 
-    Raises
-    ------
-    InputError
-        On wrong shapes, values that are not finite, and curves whose points coincide.
+    InputError on wrong shapes, values that are not finite, and curves whose points coincide.
     """
 
     frame: str  #: name of the frame that the model predicts
@@ -95,7 +90,7 @@ class ObservedSurface:
 
     def beyond(
         self, triangles: IntArray, vertices: FloatArray, distance: float | FloatArray
-    ) -> ObservedSurface:
+    ) -> "ObservedSurface":
         """The same without the points nearer than ``distance`` mm to some triangles.
 
         ``distance`` is one number or one for each point ``(q,)``.
@@ -151,7 +146,7 @@ class PredictedSurface:
         free_edge: IntArray | None,
         edge_length: float,
         width: float,
-    ) -> PredictedSurface:
+    ) -> "PredictedSurface":
         """The surface of vertices ``rest (n, 3)`` mm, with edges of a length in mm."""
         loops = () if free_edge is None else (free_edge,)
         fine = refined(rest, triangles, edge_length, loops)
@@ -159,7 +154,7 @@ class PredictedSurface:
         return cls(fine.triangles, region[fine.parent], fine.weights, width, edge)
 
     @classmethod
-    def of_valve(cls, valve: Valve, edge_length: float, width: float) -> PredictedSurface:
+    def of_valve(cls, valve: Valve, edge_length: float, width: float) -> "PredictedSurface":
         """The surface of a valve whose vertices a model predicts, with the free edge."""
         own = valve.surface
         return cls.refined(
@@ -195,11 +190,8 @@ class SurfaceObservation:
     The observation of each frame is the distances of its points, then two components of each point
     of the free edge. The model predicts these distances; zero is observed.
 
-    Raises
-    ------
-    InputError
-        On inadmissible standard deviations, frames, or curves and leaflets that the model's surface
-        does not have.
+    InputError on inadmissible standard deviations, frames, or curves and leaflets that the model's
+    surface does not have.
     """
 
     #: tuple of ObservedSurface, (f,), one for each observed frame, the closed one last
@@ -255,10 +247,7 @@ class SurfaceObservation:
 
         ``aux`` of a prediction are the observed frames with all vertices, (f, n, 3) mm.
 
-        Parameters
-        ----------
-        model : ObservationModel
-            Predicts the stacked positions ``(3 n f,)`` mm of all frames of ``predicted``.
+        ``model``: predicts the stacked positions ``(3 n f,)`` mm of all frames of ``predicted``.
         """
         observed, n = observed_frames(model, self.frames, None, self.predicted), self.surface.size
 

@@ -6,8 +6,6 @@ frames of one volume. The last two are linearised about one closed valve (`linea
 `with_samples`); another linearisation is another `FrameErrors`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -124,10 +122,7 @@ class FrameErrors:
         return family.without_columns().at(log, beats)
 
     def noise(
-        self,
-        learned: LearnedNoise | None = None,
-        *,
-        without: Collection[str] = (),
+        self, learned: LearnedNoise | None = None, *, without: Collection[str] = ()
     ) -> ObservationNoise:
         """Noise of the observation except for error samples and the sources ``without``."""
         base = self.single_noise(learned)
@@ -211,12 +206,12 @@ class FrameErrors:
             learned.append(ErrorColumns(KNOWN, np.concatenate(known, axis=1)))
         return replace(family, columns=tuple(learned))
 
-    def displaced(self, modes: tuple[FloatArray, ...]) -> FrameErrors:
+    def displaced(self, modes: tuple[FloatArray, ...]) -> "FrameErrors":
         """Errors about a geometry displaced by ``modes``, before it is linearised."""
         others = tuple(source for source in self.sources if source.modes is None)
         return FrameErrors(self.fitted, self.modes, modes, others)
 
-    def as_stated(self) -> FrameErrors:
+    def as_stated(self) -> "FrameErrors":
         """The errors if geometry and law were known: only error samples remain."""
         plain = FrameErrors(self.fitted, self.modes)
         if self.samples is None:
@@ -269,10 +264,7 @@ def linearise(
 def with_samples(errors: FrameErrors, valve: ClosedValve) -> FrameErrors:
     """The errors with the effect of the case's error samples about a closed valve.
 
-    Raises
-    ------
-    GeometryError
-        If that cannot be computed.
+    GeometryError if that cannot be computed.
     """
     case = errors.fitted.case
     found = sample_frames(case, valve)

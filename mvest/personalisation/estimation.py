@@ -5,8 +5,6 @@ another one or an estimate. Objects do not change, except that closures remember
 state, which saves time and changes no number.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,21 +23,11 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import Prediction, of_some, predict
 from mvest.estimation.run import Filter
 from mvest.estimation.transform import Log, to_filter
-from mvest.personalisation.errors import (
-    FrameErrors,
-    WeighedObservation,
-    linearise,
-    with_samples,
-)
+from mvest.personalisation.errors import FrameErrors, WeighedObservation, linearise, with_samples
 from mvest.personalisation.fitted_frames import FittedFrames
 from mvest.personalisation.geometry import displacement
 from mvest.personalisation.joint import JointPosterior, damped_step
-from mvest.personalisation.model import (
-    CaseClosure,
-    build_model,
-    held_state,
-    with_pressures,
-)
+from mvest.personalisation.model import CaseClosure, build_model, held_state, with_pressures
 from mvest.personalisation.settings import STIFFENS, PersonaliseSettings, Prior
 from mvest.personalisation.sources import ClosedValve
 from mvest.problem.estimate import Observed, Problem, StudyResult, estimate
@@ -72,7 +60,7 @@ class LinearisationPoint:
         """The valve for `linearise`."""
         return ClosedValve(self.closure.registered, self.m, self.prediction.y)
 
-    def sampled(self) -> LinearisationPoint:
+    def sampled(self) -> "LinearisationPoint":
         """The point with the effect of the error samples of its case."""
         return replace(self, errors=with_samples(self.errors, self.valve))
 
@@ -114,16 +102,13 @@ class CaseProblem:
         on_step: OnStep | None = None,
         on_iterate: OnIterate | None = None,
         model: ClosureModel | None = None,
-    ) -> CaseProblem:
+    ) -> "CaseProblem":
         """The problem of a case; the parameters are those of `personalise`.
 
         ``model`` comes from `build_model` and may have been closed.
 
-        Raises
-        ------
-        InputError
-            If the case lacks an unknown, has error samples and several fitted frames, or errors of
-            pressures are unknown but their common factor is not.
+        InputError if the case lacks an unknown, has error samples and several fitted frames, or
+        errors of pressures are unknown but their common factor is not.
         """
         settings = with_pressures(case, settings)
         if case.fitted and case.error_samples is not None:

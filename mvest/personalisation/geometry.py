@@ -4,8 +4,6 @@ Open shape, annulus, papillary tips, thickness and fibre direction are measured 
 errors. `mvest.personalisation.sources` computes what the modes do to a prediction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -208,10 +206,8 @@ def rest_lengths_by_ends(
     A closed frame without correspondence does not show the insertions, so the open frame replaces
     it. None if rest lengths were stated.
 
-    Parameters
-    ----------
-    open_moves, closed_moves : (q, c, 3) mm
-        Displacement of the insertion of each chord relative to its tip in these frames.
+    ``open_moves, closed_moves`` ``(q, c, 3) mm``: displacement of the insertion of each chord
+    relative to its tip in these frames.
     """
     if not case.chordae_follow:
         return None

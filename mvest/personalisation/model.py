@@ -1,7 +1,5 @@
 """The closure of a case as a function of its unknowns, and the gate on its uniqueness."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,17 +54,10 @@ def build_model(
 ) -> ClosureModel:
     """The closure of a case as a function of its unknowns except for the registration.
 
-    Parameters
-    ----------
-    store : Path, optional
-        Folder in which an unstructured mesh is cached.
+    InputError if an unknown is not one of the case's, or a modulus is missing. GeometryError or
+    MeshingError if the leaflets cannot be meshed.
 
-    Raises
-    ------
-    InputError
-        If an unknown is not one of the case's, or a modulus is missing.
-    GeometryError, MeshingError
-        If the leaflets cannot be meshed.
+    ``store``: folder in which an unstructured mesh is cached.
     """
     coarse = build_coarse(case, settings, store)
     solid = _solid(GivenValve(case.valve), settings.mesh, store)
@@ -140,12 +131,12 @@ class CaseClosure:
         names: tuple[str, ...],
         start: FloatArray,
         displacement: Mapping[str, FloatArray] | None = None,
-    ) -> CaseClosure:
+    ) -> "CaseClosure":
         """The closure of a valve, starting at ``start (p,)`` in the order of ``names``."""
         registered = RegisteredModel(frames or model, names)
         return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
 
-    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> CaseClosure:
+    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> "CaseClosure":
         """Closure of the valve with another geometry, see `RestGeometry.displaced`.
 
         All closed frames have the same errors of annulus and tips, as in their derivatives.

@@ -4,8 +4,6 @@ The truth of a synthetic study stays separate. ``estimate`` never sees it; only 
 ``StudyResult`` is compared with it (``StudyResult.against``).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -108,11 +106,11 @@ class StudyResult:
         return "\n".join(lines)
 
     @classmethod
-    def failed(cls, problem: Problem, reason: str) -> StudyResult:
+    def failed(cls, problem: Problem, reason: str) -> "StudyResult":
         """The result of a study without an observation."""
         return cls(problem.parameters, problem.tissue, None, None, None, reason, "", False, 0.0)
 
-    def against(self, truth: Truth | None) -> StudyResult:
+    def against(self, truth: Truth | None) -> "StudyResult":
         """The same result with the truth for comparison."""
         if truth is not None and truth.parameters != self.parameters:
             raise InputError(f"the truth is of {truth.parameters}, not of {self.parameters}")
@@ -164,18 +162,15 @@ def expected_intervals(
 ) -> list[dict[str, Any]]:
     """The 95 % interval of each unknown around its generic value, before and after an estimation.
 
+    Returns a list of dicts: ``name``, ``unit``, ``generic``, ``low_before``, ``high_before``,
+    ``low``, ``high``, and ``width``: ``after / before``.
+
     Parameters
     ----------
     names : sequence of str, (p,)
     generic : (p,)
     before, after : (p,)
         Standard deviations in filter coordinates.
-
-    Returns
-    -------
-    list of dict
-        ``name``, ``unit``, ``generic``, ``low_before``, ``high_before``, ``low``, ``high``, and
-        ``width``: ``after / before``.
     """
     z, reach = transform.forward(generic), float(ndtri(0.975))
     columns = {"name": list(names), "unit": list(map(unit_of, names)), "generic": generic.tolist()}

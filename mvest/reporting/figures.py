@@ -6,8 +6,6 @@ marker, and colour maps are perceptually uniform. Nothing here touches matplotli
 needs a display.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import textwrap
@@ -142,7 +140,7 @@ def levels(n: int) -> Any:
     return colormaps["viridis"](np.linspace(0.0, 0.85, n))
 
 
-def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
+def iterates_figure(estimates: "Sequence[EstimateRecord]") -> Figure | None:
     """Each parameter over the iterations, in a panel each; None if no estimate has iterates.
 
     A single estimate has a band of two standard deviations. The dashed line is the truth.
@@ -176,10 +174,7 @@ def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
 def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False) -> list[Path]:
     """Write ``base.png``, and ``base.pdf`` for print, with a provenance line in foot and metadata.
 
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
+    InputError if a file cannot be written.
     """
     _show_texts(figure)
     line = shown_text(line, LONGEST_LINE)

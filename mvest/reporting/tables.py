@@ -6,8 +6,6 @@ truth. Files for programs (CSV, JSON) hold every column unrounded. Texts for rea
 LaTeX) are rounded and show a value and its uncertainty in one cell.
 """
 
-from __future__ import annotations
-
 import math
 from collections import ChainMap
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,34 +24,17 @@ WIDTH, MOST_BESIDE = 100, 5
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Meaning of a column, and how readers see it.
+    """Meaning of a column, and how readers see it."""
 
-    Attributes
-    ----------
-    unit : str
-        Empty if it has none.
-    digits : str
-        Format specification such as ``.2f``; empty: three significant digits.
-    std : str
-        Column of standard deviations, shown as ``value ± std``.
-    low, high : str
-        Columns of the ends of an interval, shown as ``value (low to high)``.
-    truth : str
-        Column of true values; an interval that misses it is marked with a cross.
-    label : str
-        Heading for readers; empty: the name with spaces for underscores.
-    hidden : bool
-        Whether only files for programs have the column.
-    """
-
-    unit: str = ""
-    digits: str = ""
-    std: str = ""
+    unit: str = ""  #: empty if it has none
+    digits: str = ""  #: format specification such as ``.2f``; empty: three significant digits
+    std: str = ""  #: column of standard deviations, shown as ``value ± std``
+    #: columns of the ends of an interval, shown as ``value (low to high)``
     low: str = ""
     high: str = ""
-    truth: str = ""
-    label: str = ""
-    hidden: bool = False
+    truth: str = ""  #: column of true values; an interval that misses it is marked with a cross
+    label: str = ""  #: heading for readers; empty: the name with spaces for underscores
+    hidden: bool = False  #: whether only files for programs have the column
 
     def text(self, value: Any) -> str:
         """One value as a reader sees it."""
@@ -86,7 +67,7 @@ class Table:
         ]
 
     @property
-    def frame(self) -> DataFrame:
+    def frame(self) -> "DataFrame":
         """The table as a data frame; missing numbers are NaN."""
         import pandas as pd
 
@@ -149,7 +130,7 @@ class Table:
         return {"columns": about, "values": {k: list(v) for k, v in self.values.items()}}
 
     @classmethod
-    def of_plain(cls, data: Mapping[str, Any], where: str) -> Table:
+    def of_plain(cls, data: Mapping[str, Any], where: str) -> "Table":
         """A table from plain data; an InputError names ``where`` if they are no table."""
         try:
             columns = {name: Column(**about) for name, about in data["columns"].items()}
@@ -185,8 +166,10 @@ class Table:
         return text
 
 
-def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
+def table(rows: "Iterable[Any] | DataFrame", **columns: Column | str) -> Table:
     """A table from a data frame, or from rows that are mappings or dataclasses.
+
+    InputError if there are rows without a named column, or without one that belongs to it.
 
     Parameters
     ----------
@@ -195,11 +178,6 @@ def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
     **columns : Column or str
         Meaning of columns, in the order in which they come first; a text is
         ``unit:digits:label``, such as ``"mm:.2f"``, whose last parts may be missing.
-
-    Raises
-    ------
-    InputError
-        If there are rows without a named column, or without one that belongs to it.
     """
     plain = _plain_rows(rows)
     names = list(dict.fromkeys(name for row in plain for name in row))
@@ -236,7 +214,7 @@ def _one_line(text: str) -> str:
     return shown_text(" ".join(text.split()))
 
 
-def _plain_rows(rows: Iterable[Any] | DataFrame) -> list[dict[str, Any]]:
+def _plain_rows(rows: "Iterable[Any] | DataFrame") -> list[dict[str, Any]]:
     given: Iterable[Any] = rows.to_dict("records") if hasattr(rows, "to_dict") else rows
     plain = (asdict(row) if is_dataclass(row) else row for row in given)  # type: ignore[arg-type]
     return [{str(name): _plain(value) for name, value in row.items()} for row in plain]

@@ -1,7 +1,5 @@
 """Trains the detectors of valves in echo volumes and measures their errors."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -154,6 +152,8 @@ def calibrated(
 ) -> tuple[DetectionAccuracy, list[str]]:
     """Errors in the calibration volumes with a detected valve, and the names of these valves.
 
+    InputError if fewer than two volumes have a detected valve.
+
     Parameters
     ----------
     seen : sequence
@@ -162,11 +162,6 @@ def calibrated(
         Lowest confidence of a detected valve.
     wrong_mm : float
         A detection with this mean point error is not the valve.
-
-    Raises
-    ------
-    InputError
-        If fewer than two volumes have a detected valve.
     """
     own = _detected(seen, CALIBRATION, min_confidence, wrong_mm)
     if len(own) < 2:
@@ -243,7 +238,7 @@ def result_of(
     )
 
 
-def tables_of(trials: DataFrame, covered: Sequence[Row]) -> dict[str, Table]:
+def tables_of(trials: "DataFrame", covered: Sequence[Row]) -> dict[str, Table]:
     """The tables of a test, with the meaning of their columns (`COLUMNS`)."""
     tables = {
         "": table(kind_rows(trials)),
@@ -259,7 +254,7 @@ def tables_of(trials: DataFrame, covered: Sequence[Row]) -> dict[str, Table]:
 
 def judge(
     rows: Sequence[Row], min_confidence: float, wrong_mm: float, like_from: float
-) -> DataFrame:
+) -> "DataFrame":
     """Rows of trials; whether each is detected as a valve, correct, and unlike the training data.
 
     A valve is correct if its mean point error is below ``wrong_mm``. A volume is unlike the
@@ -279,7 +274,7 @@ def judge(
     )
 
 
-def kind_rows(trials: DataFrame) -> DataFrame:
+def kind_rows(trials: "DataFrame") -> "DataFrame":
     """A row for each kind of volume: detector confidence and fractions of correct detections.
 
     A valve is lost if nothing or something else is detected.
@@ -299,7 +294,7 @@ def kind_rows(trials: DataFrame) -> DataFrame:
     return rows.join(kinds[["lost", "unlike"]].sum()).join(kinds[shares].mean()).reset_index()
 
 
-def error_rows(trials: DataFrame) -> DataFrame:
+def error_rows(trials: "DataFrame") -> "DataFrame":
     """Mean, median and 90th percentile of absolute errors of detected valves, by kind."""
     found = trials[trials["called"] & trials["kind"].isin([*VOLUMES, *TESTED])]
     errors = found.melt("kind", list(ERRORS), "error", "size").dropna(subset="size")
@@ -310,7 +305,7 @@ def error_rows(trials: DataFrame) -> DataFrame:
     return plain.assign(unit=plain["error"].map(ERRORS))
 
 
-def figure(results: Results) -> Figure | None:
+def figure(results: Results) -> "Figure | None":
     """Confidence and surface distance in every volume; None if the run only trained."""
     from mvest.reporting.figures import COLOURS, SMALL, headline, log_axis, panels
 

@@ -1,7 +1,5 @@
 """Figure 3 of the virtual patients, and ranks of the truth in each scenario's posteriors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -30,8 +28,10 @@ LEAFLETS = ("#2b6ca3", "#c8452f")
 """Colours of the moduli."""
 
 
-def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Figure:
+def figure_3(fields: "Mapping[str, CaseFields]", denied: Sequence[str] = ()) -> "Figure":
     """The closed valves seen from the atrium, generic above personalised, on one scale.
+
+    InputError if a patient's distances are missing.
 
     Parameters
     ----------
@@ -39,11 +39,6 @@ def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Fi
         Name of each patient -> its arrays.
     denied : sequence of str
         Names of patients with the verdict "no estimate", which the figure shows above them.
-
-    Raises
-    ------
-    InputError
-        If a patient's distances are missing.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -82,7 +77,7 @@ def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Fi
     return drawn
 
 
-def _closed(valve: CaseFields, which: str) -> tuple[FloatArray, FloatArray]:
+def _closed(valve: "CaseFields", which: str) -> tuple[FloatArray, FloatArray]:
     """A model's closed positions and distances."""
     positions, distance = getattr(valve, which), getattr(valve, f"distance_{which}")
     if positions is None or distance is None:
@@ -90,7 +85,7 @@ def _closed(valve: CaseFields, which: str) -> tuple[FloatArray, FloatArray]:
     return positions[valve.closed], distance[valve.closed]
 
 
-def ranks_figure(scenarios: Groups) -> Figure:
+def ranks_figure(scenarios: Groups) -> "Figure":
     """Ranks of the truth in the posterior, one panel per scenario.
 
     Each panel shows the empirical minus the uniform distribution function of the ranks, with the

@@ -1,7 +1,5 @@
 """Figures of one case: shapes, distances and intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -92,14 +90,11 @@ def _views_figure(
     return figure, grid
 
 
-def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
+def frames_figure(case: "ValveCase", reach_mm: float) -> Figure:
     """The frames of a case as given, from two sides.
 
-    Parameters
-    ----------
-    case : ValveCase
-    reach_mm : float
-        Distance of midsurfaces within which leaflets touch. The closed frame shows its gap.
+    ``reach_mm``: distance of midsurfaces within which leaflets touch. The closed frame shows its
+    gap.
     """
     # Figures of a synthetic valve do not need what this imports.
     from mvest.cases.case import Role
@@ -144,17 +139,14 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
 
     A generic valve is drawn next to it on the same scale.
 
+    InputError if the personalised shape or its distances are missing.
+
     Parameters
     ----------
     fields : CaseFields or Path
         A path is read by `mvest.problem.fields.case_fields`.
     names : sequence of str
         Of the leaflets, written next to them.
-
-    Raises
-    ------
-    InputError
-        If the personalised shape or its distances are missing.
     """
     fields = case_fields(fields) if isinstance(fields, Path) else fields
     if fields.fitted is None or fields.distance_fitted is None:

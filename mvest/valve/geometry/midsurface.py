@@ -7,8 +7,6 @@ sheet of the tissue. Near the edges, where the nearest wall is the rim, the thic
 the tissue farther in.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -45,31 +43,18 @@ TIP_CONE = 60.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Midsurface:
-    """The midsurface of two leaflets.
+    """The midsurface of two leaflets."""
 
-    Attributes
-    ----------
-    vertices : (n, 3) mm
-        A grid: vertex ``j * columns + i`` is column i, row j. The first row is the annulus, the
-        last the free edge; the commissures are columns 0 and ``columns / 2``.
-    triangles : (m, 3)
-        Facing the ventricle.
-    region : (m,)
-        0 anterior, 1 posterior.
-    thickness : (n,) mm
-    annulus, free_edge : (columns,)
-        Vertices in loop order.
-    derived : tuple of str
-        Properties that were not given but derived from the shape.
-    """
-
+    #: (n, 3) mm, a grid: vertex ``j * columns + i`` is column i, row j. The first row is the
+    #: annulus, the last the free edge; the commissures are columns 0 and ``columns / 2``.
     vertices: FloatArray
-    triangles: IntArray
-    region: IntArray
-    thickness: FloatArray
+    triangles: IntArray  #: (m, 3), facing the ventricle
+    region: IntArray  #: (m,), 0 anterior, 1 posterior
+    thickness: FloatArray  #: (n,) mm
+    #: (columns,), vertices in loop order
     annulus: IntArray
     free_edge: IntArray
-    derived: tuple[str, ...]
+    derived: tuple[str, ...]  #: properties that were not given but derived from the shape
 
     @property
     def commissures(self) -> IntArray:
@@ -83,7 +68,7 @@ class Midsurface:
         grid = self.vertices.reshape(-1, len(self.annulus), 3)
         return np.asarray(_arc_lengths(grid)[-1].reshape(2, -1).max(axis=1))
 
-    def exchanged(self) -> Midsurface:
+    def exchanged(self) -> "Midsurface":
         """The same surface with anterior and posterior leaflets swapped."""
         columns = len(self.annulus)
 
@@ -93,7 +78,7 @@ class Midsurface:
 
         return replace(self, vertices=turned(self.vertices), thickness=turned(self.thickness))
 
-    def smoothed(self, width_mm: float) -> tuple[Midsurface, float]:
+    def smoothed(self, width_mm: float) -> "tuple[Midsurface, float]":
         """Smooth the surface around the valve; also return the largest move (mm) of a vertex.
 
         The Gaussian weights have the standard deviation `width_mm` along the annulus, and
@@ -118,6 +103,8 @@ def midsurface(
 ) -> Midsurface:
     """Compute the midsurface of two thick leaflets around one orifice.
 
+    GeometryError if the surface is not a closed thin band, or the leaflets cannot be distinguished.
+
     Parameters
     ----------
     vertices, triangles
@@ -134,11 +121,6 @@ def midsurface(
         Returns the leaflet (0 anterior, 1 posterior) of points ``(k, 3)``, if known.
     edge_mm
         Mean edge length of the triangles.
-
-    Raises
-    ------
-    GeometryError
-        The surface is not a closed thin band, or the leaflets cannot be distinguished.
     """
     first, second = walls(*closed_band(vertices, triangles))
     derived: list[str] = []
