@@ -7,6 +7,8 @@ Keys change with any code of `mvest`, and with that of the maker's package. Data
 are not code; callers describe them.
 """
 
+from __future__ import annotations
+
 import functools
 import hashlib
 import sys
@@ -161,7 +163,7 @@ def content_digest(*values: Any) -> str:
     return digest.hexdigest()
 
 
-def _feed(digest: "hashlib._Hash", value: Any) -> None:
+def _feed(digest: hashlib._Hash, value: Any) -> None:
     if isinstance(value, np.ndarray):
         digest.update(f"array {value.dtype.str} {value.shape} ".encode())
         digest.update(np.ascontiguousarray(value).tobytes())

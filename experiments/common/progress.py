@@ -4,6 +4,8 @@ A terminal shows a bar. Elsewhere, and for events that matter, lines go to stand
 a sweep is the job's log. There is a line at least every ten seconds.
 """
 
+from __future__ import annotations
+
 import math
 import sys
 import threading
@@ -98,7 +100,7 @@ class SolveBar:
         self._lines = Heartbeat(self._bar, self._status)
         self._solve_began = self._now = self._lines.began
 
-    def __enter__(self) -> "SolveBar":
+    def __enter__(self) -> SolveBar:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -180,7 +182,7 @@ class PartBar:
         self._lines = Heartbeat(self._bar, self._status)
         self._last = self._lines.began
 
-    def __enter__(self) -> "PartBar":
+    def __enter__(self) -> PartBar:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

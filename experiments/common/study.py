@@ -5,6 +5,8 @@ A study is a module ``experiments/studies/NAME.py``, or a package of that name, 
 prints in one line.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -81,7 +83,7 @@ class Study(Generic[S]):
     # Tables for readers, by name. The results' own tables are then written as CSV only.
     summary: Callable[[Results], Mapping[str, Table]] | None = None
     # A figure, figures by name ("" is the main one), or None if there is nothing to draw.
-    figure: "Callable[[Results], Figure | Mapping[str, Figure] | None] | None" = None
+    figure: Callable[[Results], Figure | Mapping[str, Figure] | None] | None = None
     captions: Mapping[str, str] = field(default_factory=dict)  # by name of the figure
     latex: tuple[str, ...] = ()  # names of the paper's own tables and figures: LaTeX and PDF, too
     words: Callable[[Record], str] | None = None  # text for the terminal; None: the tables

@@ -4,6 +4,8 @@ It is made for statistics programs: each column has one type and one stated unit
 written as a data dictionary), failures are rows without numbers, and nothing is aggregated.
 """
 
+from __future__ import annotations
+
 import json
 import sys
 from collections.abc import Iterator
@@ -67,7 +69,7 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
 """Column -> type, unit and meaning; ``as unit`` where the column ``unit`` says it."""
 
 
-def estimate_table(folder: Path) -> "DataFrame":
+def estimate_table(folder: Path) -> DataFrame:
     """The estimates of all records and sweeps below a folder of runs, or of published results.
 
     A file that is unreadable, foreign or changed costs a line of warning. MLflow's copies are left
@@ -105,7 +107,7 @@ def estimate_table(folder: Path) -> "DataFrame":
     return _typed(rows)
 
 
-def sweep_table(sweep: Sweep) -> "DataFrame":
+def sweep_table(sweep: Sweep) -> DataFrame:
     """The estimates of a collected sweep, with a row without numbers for a lost job."""
     return _typed(_of_sweep(sweep))
 
@@ -155,7 +157,7 @@ def _rows(record: Record, place: str | None, **more: Any) -> Iterator[dict[str, 
             yield {**common, **row, "reason": " ".join(row["reason"].split())}
 
 
-def _typed(rows: list[dict[str, Any]]) -> "DataFrame":
+def _typed(rows: list[dict[str, Any]]) -> DataFrame:
     from pandas import DataFrame, Series
 
     return DataFrame(

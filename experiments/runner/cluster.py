@@ -4,6 +4,8 @@ Dask places jobs, waits, adds and removes workers, and runs the job of a lost wo
 another one. Processes and limits of a job are not dask's business: `engine.execute` manages them.
 """
 
+from __future__ import annotations
+
 import logging
 import os
 import shlex
@@ -128,7 +130,7 @@ def _there(
 
 
 @contextmanager
-def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) -> "Iterator[Client]":
+def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) -> Iterator[Client]:
     """A client of the named scheduler, or of a new cluster that ends with the client.
 
     The cluster's logs and certificates are in ``folder``. Raises a `ConfigurationError` if there

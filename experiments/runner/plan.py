@@ -4,6 +4,8 @@
 scheduler (`Plan.read`), by MLflow, and by the same command when it goes on.
 """
 
+from __future__ import annotations
+
 import os
 import time
 import uuid
@@ -73,7 +75,7 @@ class Plan:
                     f"two jobs {what}: {' '.join(other.overrides)} and {' '.join(job.overrides)}"
                 )
 
-    def write(self) -> "Plan":
+    def write(self) -> Plan:
         """Write ``plan.json``, of later jobs only the differences to the first one."""
         self.folder.mkdir(parents=True, exist_ok=True)
         place, created = self.folder / PLAN, time.gmtime()
@@ -113,7 +115,7 @@ class Plan:
         return replace(self, written_ns=place.stat().st_mtime_ns)
 
     @classmethod
-    def read(cls, folder: Path, *, look: bool = True) -> "Plan":
+    def read(cls, folder: Path, *, look: bool = True) -> Plan:
         """The plan in a sweep's folder; ``look`` reads the records of earlier attempts.
 
         Changes to the directory in which the sweep was planned.

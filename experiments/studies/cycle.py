@@ -4,6 +4,8 @@ All results come from one simulated cycle of a valve with known parameters. The 
 `joint`, `joint_open` and `chord` differ in their unknowns and estimates.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -219,7 +221,7 @@ def expect_cycle(values: Values, _folder: Path | None = None) -> str:
         return expectation_text(f"{values['name']}, {values['row']}", problem, seen, noise)
 
 
-def figure(results: Results) -> "Figure":
+def figure(results: Results) -> Figure:
     """Bounds for sets of frames, and the errors of estimates if there are any."""
     from mvest.reporting.figures import COLOURS, MARKERS, SMALL, log_axis, panels
 

@@ -4,6 +4,8 @@ A single model is fitted to observed positions. If there are several models, eac
 predictions that some of them make for known parameters.
 """
 
+from __future__ import annotations
+
 import runpy
 import sys
 from dataclasses import dataclass, field, replace
@@ -254,7 +256,7 @@ def check_external(values: Values, folder: Path) -> str:
     )
 
 
-def figure(results: Results) -> "Figure | None":
+def figure(results: Results) -> Figure | None:
     """Iterates of each parameter, for each model."""
     from mvest.reporting.figures import iterates_figure
 

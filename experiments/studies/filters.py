@@ -1,5 +1,7 @@
 """Runs all filters on the same problems and compares them with draws from the posterior."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -203,7 +205,7 @@ def build_problem(config: Values, name: str, about: FilterProblem) -> Problem:
     return Problem(name, about, twin.model, model, prior)
 
 
-def figure(results: Results) -> "Figure":
+def figure(results: Results) -> Figure:
     """The 95 % intervals of each filter relative to those of the reference."""
     from textwrap import fill
 

@@ -4,6 +4,8 @@ The gate closes an anatomy under variations that must not matter, and follows it
 (`mvest.closure.robustness`). With ``gate.every_step`` it measures one closure step by step instead.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -124,7 +126,7 @@ CURVES = {
 }
 
 
-def figure(results: Results) -> "Figure | None":
+def figure(results: Results) -> Figure | None:
     """Four moments of a closing valve from the atrium, the side and in section; its measures."""
     name, record = next(iter(results.records.items()))
     if name not in results.arrays:

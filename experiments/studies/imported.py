@@ -5,6 +5,8 @@ closes the shape of a reference heart (``heart``), and estimates known moduli on
 not part of this project; ``conf/experiment`` names their sources.
 """
 
+from __future__ import annotations
+
 import shutil
 from collections.abc import Mapping
 from copy import copy
@@ -348,7 +350,7 @@ def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:
     return record_of(found, seed=values["seed"], case=name, simulated=True)
 
 
-def figure(results: Results) -> "Figure | None":
+def figure(results: Results) -> Figure | None:
     """The closed donor valve with generic and fitted moduli, or the heart valve open and closed."""
     from matplotlib.figure import Figure
 

@@ -5,6 +5,8 @@ and observed with errors. The study estimates the parameters and predicts scenar
 and at posterior samples, then computes the same scenarios with the true parameters.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -211,7 +213,7 @@ def _patient(
     return result, compared
 
 
-def _fields(valve: Valve, compared: Mapping[str, Compared]) -> "dict[str, NDArray[Any]]":
+def _fields(valve: Valve, compared: Mapping[str, Compared]) -> dict[str, NDArray[Any]]:
     """Closed shapes at the estimate, as case fields; NaN if a valve did not close."""
     blank = np.full(valve.surface.vertices.shape, np.nan)
     shapes = [blank if found.shape is None else found.shape for found, *_ in compared.values()]
@@ -277,7 +279,7 @@ def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]
 
 
 # -- figure ---------------------------------------------------------------------------------------
-def figure(results: Results) -> "Figure | None":
+def figure(results: Results) -> Figure | None:
     """The first patient's closed valve by condition from the atrium, and its measures.
 
     Touching midsurfaces are one thickness apart, so the slit between them is drawn as tissue. Gaps
@@ -331,7 +333,7 @@ def figure(results: Results) -> "Figure | None":
     return drawn
 
 
-def _draw_measure(axes: Any, rows: "DataFrame", titles: Sequence[str]) -> None:
+def _draw_measure(axes: Any, rows: DataFrame, titles: Sequence[str]) -> None:
     """Draw one measure of all patients; matplotlib leaves out missing values."""
     from mvest.reporting.figures import COLOURS, SMALL, plain_axes
 

@@ -1,5 +1,7 @@
 """Simulates an observation, estimates from it, and compares with the truth."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -203,7 +205,7 @@ def summary(results: Results) -> dict[str, Table]:
     return {"": table([*paper, *rows], **whole.columns)}
 
 
-def figure(results: Results) -> "dict[str, Figure]":
+def figure(results: Results) -> dict[str, Figure]:
     """Iterates of the main estimate, and the fitted valve if its arrays are stored."""
     from mvest.reporting.case.figures import case_figure
     from mvest.reporting.figures import iterates_figure

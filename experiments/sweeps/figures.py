@@ -1,5 +1,7 @@
 """Figures of any sweep: errors along each factor, and errors over two factors."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from itertools import combinations
 from textwrap import fill
@@ -47,7 +49,7 @@ def figures_of(sweep: Sweep) -> dict[str, Figure]:
     return {name: figure for name, figure in drawn.items() if figure is not None}
 
 
-def _along(sweep: Sweep, runs: "DataFrame", values: Values) -> Figure | None:
+def _along(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
     """Error and interval of each parameter against each factor, over all values of the others."""
     if not values:
         return None
@@ -79,7 +81,7 @@ def _along(sweep: Sweep, runs: "DataFrame", values: Values) -> Figure | None:
 
 
 def _panel(
-    axes: Any, sweep: Sweep, runs: "DataFrame", column: str, values: Sequence[Any]
+    axes: Any, sweep: Sweep, runs: DataFrame, column: str, values: Sequence[Any]
 ) -> list[float]:
     """Draw one factor; returns the largest errors or intervals at each of its values."""
     places = _places(values)
@@ -135,7 +137,7 @@ def _places(values: Sequence[Any]) -> FloatArray:
     return logarithms if even.min() / even.max() >= uneven.min() / uneven.max() else numbers
 
 
-def _matrix(sweep: Sweep, runs: "DataFrame", values: Values) -> Figure | None:
+def _matrix(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
     """Error of the worst parameter over the two factors with the most combinations of values."""
     if len(values) < 2:
         return None

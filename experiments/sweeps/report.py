@@ -4,6 +4,8 @@ They follow from the collected sweep alone, not from when or where a run was mad
 give equal files.
 """
 
+from __future__ import annotations
+
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -54,7 +56,7 @@ RENAMED = {
 }  # fmt: skip
 """Columns of `EstimateRecord.rows` -> their names here."""
 
-STATISTICS: "dict[str, tuple[Column, Callable[[DataFrame], Any]]]" = {
+STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
     "estimate": (
         Column(UNIT, std="SD over runs", label="mean estimate ± SD over runs"),
         lambda good: good["estimate"].mean(),
@@ -158,14 +160,14 @@ def shortened(whole: Table) -> Table:
     return Table(values, whole.columns)
 
 
-def good_of(runs: "DataFrame") -> "DataFrame":
+def good_of(runs: DataFrame) -> DataFrame:
     """The rows of converged runs, with numbers as floats."""
     numbers = [name for name in runs if COLUMNS.get(str(name)) in (UNIT, "%", "mm")]
     good = runs[(runs["status"] == CONVERGED) & runs["estimate"].notna()]
     return good.astype(dict.fromkeys([*numbers, "forward solves"], float))
 
 
-def values_of(sweep: Sweep, runs: "DataFrame") -> dict[str, list[Any]]:
+def values_of(sweep: Sweep, runs: DataFrame) -> dict[str, list[Any]]:
     """Column of each varied factor -> its values, numbers in increasing order."""
     found = {}
     for name, (column, _) in factors_of(sweep).items():
@@ -220,7 +222,7 @@ def by_setting(sweep: Sweep) -> Table:
     return _table(sweep, rows, about)
 
 
-def _words(run: "Series[Any]", names: Sequence[str], units: Mapping[str, str]) -> str:
+def _words(run: Series[Any], names: Sequence[str], units: Mapping[str, str]) -> str:
     """A run's values of some factors: texts, and numbers with name and unit."""
     words = []
     for name in names:
@@ -233,7 +235,7 @@ def _words(run: "Series[Any]", names: Sequence[str], units: Mapping[str, str]) -
     return ", ".join(words) or "all runs"
 
 
-def _statistics(runs: "DataFrame") -> dict[str, Any]:
+def _statistics(runs: DataFrame) -> dict[str, Any]:
     """Numbers of a parameter in a group of runs; NaN or None without converged runs."""
     good = good_of(runs)
     lost = runs.drop(good.index)["reason"]
@@ -247,7 +249,7 @@ def _statistics(runs: "DataFrame") -> dict[str, Any]:
     }
 
 
-def _coverage(good: "DataFrame") -> tuple[float | None, float | None, float | None]:
+def _coverage(good: DataFrame) -> tuple[float | None, float | None, float | None]:
     """Share (%) of intervals that contain the truth, and its 95 % interval (Wilson)."""
     from scipy.stats import binomtest
 

@@ -10,6 +10,8 @@ the share of the arc length between the commissures, on the annulus (s = 0) and 
 = 1). Between the two, the harmonic angle of a phi is linear in s.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -296,7 +298,7 @@ class LeafletBand:
         annulus: IntArray,
         free_edge: IntArray,
         anterior: int,
-    ) -> "LeafletBand":
+    ) -> LeafletBand:
         """Solve for the coordinates of a band; ``anterior`` is the number of that leaflet.
 
         GeometryError if the coordinates fold over, or a leaflet does not meet the annulus or the

@@ -4,6 +4,8 @@ Distances are measured in coordinates in which closed states change evenly: the 
 parameters.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +29,7 @@ class ClosedState:
 
     at: FloatArray  #: (p,), its parameters
     positions: FloatArray  #: (n, 3) mm, of the mesh's nodes
-    guide: "ClosedState | None" = None  #: closed state of the model's guide
+    guide: ClosedState | None = None  #: closed state of the model's guide
     #: (p, n, 3) mm or None, derivatives of the positions with respect to the parameters, if known
     slopes: FloatArray | None = None
 
@@ -44,7 +46,7 @@ class Coordinates:
     offsets: FloatArray
 
     @classmethod
-    def of(cls, names: tuple[str, ...], settings: MechanicsSettings) -> "Coordinates":
+    def of(cls, names: tuple[str, ...], settings: MechanicsSettings) -> Coordinates:
         """Coordinates of the named parameters under the settings of a model."""
         units, offsets = [], []
         for name in names:

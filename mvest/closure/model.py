@@ -3,6 +3,8 @@
 ``ClosureModel`` predicts the observed vertices from the parameters of valve and mechanics.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -84,7 +86,7 @@ class ClosureModel:
     #: the same valve and parameters on a coarser mesh. A closure that would start from the open
     #: valve is computed there first; its closed state is the starting point for the equilibrium on
     #: this mesh. A guide may have a guide.
-    guide: "ClosureModel | None" = None
+    guide: ClosureModel | None = None
     #: whether a failed continued closure is repeated with the guide, and then from the open valve,
     #: which takes long and seldom succeeds
     repeat: bool = True
@@ -120,7 +122,7 @@ class ClosureModel:
                 f"model: {', '.join(self.names)}"
             )
 
-    def fresh(self) -> "ClosureModel":
+    def fresh(self) -> ClosureModel:
         """A copy that has built and closed nothing yet, without a progress callback."""
         guide = None if self.guide is None else self.guide.fresh()
         return replace(self, guide=guide, on_step=None)
@@ -196,7 +198,7 @@ class ClosureModel:
         self.relaxed = plain.settings, self.mesh, green
         return green
 
-    def _linear(self, relaxation: Relaxation) -> "ClosureModel":
+    def _linear(self, relaxation: Relaxation) -> ClosureModel:
         """The same valve with linear tissue that is free of stress when open."""
         tissue = self.settings.tissue.items()
         settings = replace(

@@ -25,6 +25,8 @@ the limit; a derivative that is wrong only at an end of the path; and whether a 
 the resolution is continuous, which does not affect an estimate of that modulus.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -71,7 +73,7 @@ class Piece:
     way: float
 
     @classmethod
-    def between(cls, low: float, high: float, states: Mapping[float, PathState]) -> "Piece":
+    def between(cls, low: float, high: float, states: Mapping[float, PathState]) -> Piece:
         """The piece between the states at two factors."""
         a, b, width = states[low], states[high], np.log(high / low)
         unexplained = b.y - a.y - 0.5 * width * (a.slope + b.slope)

@@ -12,6 +12,8 @@ the quantities have a normal prior; `mvest.estimation.evidence` learns them. Oth
 quantities, which change the observation by columns C, add C Cᵀ.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -41,7 +43,7 @@ class ObservationNoise:
     whiten: Callable[[FloatArray], FloatArray]
 
 
-def observation_noise(R: "NoiseCovariance", size: int) -> ObservationNoise:
+def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
     """Check the noise covariance of ``size`` observations and factorise it once.
 
     InputError if R has the wrong size, or is not symmetric positive definite.
@@ -264,11 +266,11 @@ class NoiseFamily:
             scipy.linalg.block_diag(self.bands.covariance, covariance),
         )
 
-    def plus(self, columns: ErrorColumns) -> "NoiseFamily":
+    def plus(self, columns: ErrorColumns) -> NoiseFamily:
         """The family with further columns added."""
         return replace(self, columns=(*self.columns, columns))
 
-    def without_columns(self) -> "NoiseFamily":
+    def without_columns(self) -> NoiseFamily:
         """The family without added columns."""
         return replace(self, columns=())
 

@@ -4,6 +4,8 @@ Rules and defaults follow the JSON schema ``markups-schema-v1.0.3.json`` of Slic
 and its reader ``vtkMRMLMarkupsJsonStorageNode``. Positions here are LPS in mm.
 """
 
+from __future__ import annotations
+
 import csv
 import json
 import re
@@ -42,7 +44,7 @@ class PointList:
     unplaced: tuple[str, ...] = ()  # labels of listed points without a position
 
     @classmethod
-    def numbered(cls, name: str, points: FloatArray, kind: str = "Fiducial") -> "PointList":
+    def numbered(cls, name: str, points: FloatArray, kind: str = "Fiducial") -> PointList:
         """Points ``(n, 3)`` labelled ``name-1``, ``name-2``, ..."""
         return cls(tuple(f"{name}-{i + 1}" for i in range(len(points))), points, kind)
 

@@ -9,6 +9,8 @@ triangle is stored. Follower pressure adds a skew part along the rim of the load
 has blocks of its own.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,7 +36,7 @@ class SparsityPattern:
     skew: IntArray  #: ``(s, 2)`` sorted rows and columns of the skew blocks, with row <= column
 
     @classmethod
-    def of(cls, coupled: sparse.csr_matrix, skew: IntArray) -> "SparsityPattern":
+    def of(cls, coupled: sparse.csr_matrix, skew: IntArray) -> SparsityPattern:
         """Pattern of a symmetric matrix ``coupled (n, n)`` with its full diagonal.
 
         ``skew (s, 2)`` are pairs of nodes with unsymmetric coupling, in any order.
@@ -46,7 +48,7 @@ class SparsityPattern:
 
     def with_coupling(
         self, elements: IntArray, pairs: IntArray, around: tuple[IntArray, IntArray]
-    ) -> "SparsityPattern":
+    ) -> SparsityPattern:
         """The pattern with all nodes of the element ``pairs (g, 2)`` coupled in addition.
 
         ``elements (e, k)`` have the nodes, and ``around`` is from `elements_of_nodes`.
@@ -106,7 +108,7 @@ class SparsityPattern:
         """Block data ``(u + s, 3, 3)``."""
         return np.zeros((len(self.columns) + len(self.skew), 3, 3))
 
-    def matrix(self, blocks: FloatArray) -> "BlockMatrix":
+    def matrix(self, blocks: FloatArray) -> BlockMatrix:
         """The matrix ``(3n, 3n)`` that refers to the given block data."""
         return BlockMatrix(self, blocks)
 

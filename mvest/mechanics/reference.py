@@ -14,6 +14,8 @@ differentiated by hand. Embedded points and candidate pairs stay in the material
 pair at rest, which limits its reach, changes with the geometry.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -58,7 +60,7 @@ class RestVariation:
         return len(self.nodes)
 
     @classmethod
-    def joined(cls, parts: "Sequence[RestVariation]") -> "RestVariation":
+    def joined(cls, parts: Sequence[RestVariation]) -> RestVariation:
         """The quantities of several variations of one body, one after another."""
         joined: dict[str, Any] = {}
         for name, own in cls._given(parts).items():
@@ -68,7 +70,7 @@ class RestVariation:
         return cls(**joined)
 
     @classmethod
-    def summed(cls, parts: "Sequence[RestVariation]") -> "RestVariation":
+    def summed(cls, parts: Sequence[RestVariation]) -> RestVariation:
         """As many quantities, each with its changes in all parts at once."""
         summed: dict[str, Any] = {}
         for name, own in cls._given(parts).items():
@@ -77,7 +79,7 @@ class RestVariation:
         return cls(**summed)
 
     @classmethod
-    def _given(cls, parts: "Sequence[RestVariation]") -> dict[str, dict[int, Any]]:
+    def _given(cls, parts: Sequence[RestVariation]) -> dict[str, dict[int, Any]]:
         """Field -> number of a part -> values, for the fields that a part has."""
         own = {f.name: {k: getattr(p, f.name) for k, p in enumerate(parts)} for f in fields(cls)}
         own = {name: {k: v for k, v in each.items() if v is not None} for name, each in own.items()}

@@ -1,5 +1,7 @@
 """Sparse direct solvers: PARDISO (Intel MKL, x86-64 only) if installed, or SciPy's SuperLU."""
 
+from __future__ import annotations
+
 import ctypes
 import os
 import sys
@@ -147,7 +149,7 @@ class PardisoSolver:
             self._pardiso.analyse(self._factor, 0 if pattern.n < NESTED_FROM else 2)
         self._pardiso.factorize()
 
-    def _substitute(self, matrix: BlockMatrix) -> "SuperLUSolver":
+    def _substitute(self, matrix: BlockMatrix) -> SuperLUSolver:
         self._whole = SuperLUSolver()
         self._whole.factorize(matrix)
         self._substituted += 1
@@ -218,7 +220,7 @@ class _Pardiso:
         """Whether the factor is of single precision."""
         return bool(self.settings[27])
 
-    def analyse(self, blocks: "_Blocks", ordering: int) -> None:
+    def analyse(self, blocks: _Blocks, ordering: int) -> None:
         """Symbolic analysis; numeric factorisations read the same arrays."""
         self._blocks = blocks
         self.settings[1] = ordering
@@ -270,7 +272,7 @@ class _Pardiso:
         return np.asarray(out, dtype=np.float64)
 
 
-def _pointer(array: NDArray[Any], kind: "type[ctypes._SimpleCData[Any]] | None" = None) -> Any:
+def _pointer(array: NDArray[Any], kind: type[ctypes._SimpleCData[Any]] | None = None) -> Any:
     """Address of the array."""
     if kind is None:
         return ctypes.c_void_p(array.ctypes.data)
@@ -302,7 +304,7 @@ class _Blocks:
     @classmethod
     def of(
         cls, pattern: SparsityPattern, kept: BoolArray, precision: type[np.floating[Any]]
-    ) -> "_Blocks":
+    ) -> _Blocks:
         """The blocks marked in ``kept (u,)``, without their entries."""
         here = np.flatnonzero(kept)
         pointer = np.searchsorted(here, pattern.pointer).astype(np.int32) + 1

@@ -5,6 +5,8 @@ with one random generator; vertices that are not seen become NaN. A filter's ass
 are configured separately.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
@@ -67,7 +69,7 @@ class SpatialCorrelation:
     #: (n, n), lower triangular L with L Lᵀ = C and rows of length one; 3248 vertices take a second
     #: and 84 MB
     factor: FloatArray = field(init=False, repr=False)
-    _parts: "dict[bytes, SpatialCorrelation]" = field(default_factory=dict, init=False, repr=False)
+    _parts: dict[bytes, SpatialCorrelation] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points, dtype=np.float64)
@@ -92,7 +94,7 @@ class SpatialCorrelation:
         np.fill_diagonal(C, 1.0)
         return C
 
-    def of(self, members: BoolArray) -> "SpatialCorrelation":
+    def of(self, members: BoolArray) -> SpatialCorrelation:
         """The correlation among some of the points; ``members (n,)``. Factorised once for each."""
         if members.all():
             return self

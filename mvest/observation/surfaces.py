@@ -25,6 +25,8 @@ Limits:
 * Points must lie on what the model predicts, the midsurface of the leaflets.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -90,7 +92,7 @@ class ObservedSurface:
 
     def beyond(
         self, triangles: IntArray, vertices: FloatArray, distance: float | FloatArray
-    ) -> "ObservedSurface":
+    ) -> ObservedSurface:
         """The same without the points nearer than ``distance`` mm to some triangles.
 
         ``distance`` is one number or one for each point ``(q,)``.
@@ -146,7 +148,7 @@ class PredictedSurface:
         free_edge: IntArray | None,
         edge_length: float,
         width: float,
-    ) -> "PredictedSurface":
+    ) -> PredictedSurface:
         """The surface of vertices ``rest (n, 3)`` mm, with edges of a length in mm."""
         loops = () if free_edge is None else (free_edge,)
         fine = refined(rest, triangles, edge_length, loops)
@@ -154,7 +156,7 @@ class PredictedSurface:
         return cls(fine.triangles, region[fine.parent], fine.weights, width, edge)
 
     @classmethod
-    def of_valve(cls, valve: Valve, edge_length: float, width: float) -> "PredictedSurface":
+    def of_valve(cls, valve: Valve, edge_length: float, width: float) -> PredictedSurface:
         """The surface of a valve whose vertices a model predicts, with the free edge."""
         own = valve.surface
         return cls.refined(

@@ -6,6 +6,8 @@ frames of one volume. The last two are linearised about one closed valve (`linea
 `with_samples`); another linearisation is another `FrameErrors`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -206,12 +208,12 @@ class FrameErrors:
             learned.append(ErrorColumns(KNOWN, np.concatenate(known, axis=1)))
         return replace(family, columns=tuple(learned))
 
-    def displaced(self, modes: tuple[FloatArray, ...]) -> "FrameErrors":
+    def displaced(self, modes: tuple[FloatArray, ...]) -> FrameErrors:
         """Errors about a geometry displaced by ``modes``, before it is linearised."""
         others = tuple(source for source in self.sources if source.modes is None)
         return FrameErrors(self.fitted, self.modes, modes, others)
 
-    def as_stated(self) -> "FrameErrors":
+    def as_stated(self) -> FrameErrors:
         """The errors if geometry and law were known: only error samples remain."""
         plain = FrameErrors(self.fitted, self.modes)
         if self.samples is None:

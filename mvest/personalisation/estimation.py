@@ -5,6 +5,8 @@ another one or an estimate. Objects do not change, except that closures remember
 state, which saves time and changes no number.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -60,7 +62,7 @@ class LinearisationPoint:
         """The valve for `linearise`."""
         return ClosedValve(self.closure.registered, self.m, self.prediction.y)
 
-    def sampled(self) -> "LinearisationPoint":
+    def sampled(self) -> LinearisationPoint:
         """The point with the effect of the error samples of its case."""
         return replace(self, errors=with_samples(self.errors, self.valve))
 
@@ -102,7 +104,7 @@ class CaseProblem:
         on_step: OnStep | None = None,
         on_iterate: OnIterate | None = None,
         model: ClosureModel | None = None,
-    ) -> "CaseProblem":
+    ) -> CaseProblem:
         """The problem of a case; the parameters are those of `personalise`.
 
         ``model`` comes from `build_model` and may have been closed.

@@ -5,6 +5,8 @@ of all other errors, and errors e of single observations. z and g have independe
 small matrices are needed. Results are plain rows, as in `mvest.personalisation.record`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -56,7 +58,7 @@ class LinearModel:
     learned: LearnedNoise | None = None  #: None: errors as stated
 
     @classmethod
-    def of(cls, filtered: Estimate, errors: FrameErrors) -> "LinearModel":
+    def of(cls, filtered: Estimate, errors: FrameErrors) -> LinearModel:
         """About an estimate."""
         prior = to_filter(filtered.transform, filtered.prior).covariance
         return cls(filtered.names, prior, slopes(filtered), errors, filtered.learned)

@@ -1,5 +1,7 @@
 """The closure of a case as a function of its unknowns, and the gate on its uniqueness."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -131,12 +133,12 @@ class CaseClosure:
         names: tuple[str, ...],
         start: FloatArray,
         displacement: Mapping[str, FloatArray] | None = None,
-    ) -> "CaseClosure":
+    ) -> CaseClosure:
         """The closure of a valve, starting at ``start (p,)`` in the order of ``names``."""
         registered = RegisteredModel(frames or model, names)
         return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
 
-    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> "CaseClosure":
+    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> CaseClosure:
         """Closure of the valve with another geometry, see `RestGeometry.displaced`.
 
         All closed frames have the same errors of annulus and tips, as in their derivatives.

@@ -4,6 +4,8 @@ The truth of a synthetic study stays separate. ``estimate`` never sees it; only 
 ``StudyResult`` is compared with it (``StudyResult.against``).
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -106,11 +108,11 @@ class StudyResult:
         return "\n".join(lines)
 
     @classmethod
-    def failed(cls, problem: Problem, reason: str) -> "StudyResult":
+    def failed(cls, problem: Problem, reason: str) -> StudyResult:
         """The result of a study without an observation."""
         return cls(problem.parameters, problem.tissue, None, None, None, reason, "", False, 0.0)
 
-    def against(self, truth: Truth | None) -> "StudyResult":
+    def against(self, truth: Truth | None) -> StudyResult:
         """The same result with the truth for comparison."""
         if truth is not None and truth.parameters != self.parameters:
             raise InputError(f"the truth is of {truth.parameters}, not of {self.parameters}")

@@ -4,6 +4,8 @@ Pydantic converts it (``record.model_dump(mode="json")``, ``EstimateRecord.model
 Infinite and unknown numbers are None, since JSON has neither.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -42,7 +44,7 @@ class Spread(Frozen):
     max: float
 
     @classmethod
-    def of(cls, values: FloatArray) -> "Spread":
+    def of(cls, values: FloatArray) -> Spread:
         """Of the finite values; InputError if there is none."""
         known = values[np.isfinite(values)]
         if not known.size:
@@ -147,7 +149,7 @@ class EstimateRecord(Frozen):
     seconds: float | None = None  #: wall-clock time of the estimation
     #: Name -> another estimate from the same data: ``moduli_only`` with all nuisances fixed,
     #: ``paper`` by the paper's method.
-    alternatives: "Mapping[str, EstimateRecord]" = {}
+    alternatives: Mapping[str, EstimateRecord] = {}
     #: Name -> rows of plain data for reports (see `mvest.personalisation.record`).
     details: Mapping[str, tuple[Row, ...]] = {}
 
@@ -179,7 +181,7 @@ class EstimateRecord(Frozen):
         """The rows of a detail; empty if it was not computed."""
         return self.details.get(name, ())
 
-    def without_details(self, *kept: str) -> "EstimateRecord":
+    def without_details(self, *kept: str) -> EstimateRecord:
         """A copy without iterates, correlations, trade-offs and details, except those ``kept``."""
         nothing: dict[str, Any] = dict.fromkeys(
             ("correlation", "iterates", "iterate_std", "objective", "flat", "confounded"), ()
@@ -188,7 +190,7 @@ class EstimateRecord(Frozen):
         others = {name: other.without_details() for name, other in self.alternatives.items()}
         return self.model_copy(update={**nothing, "details": details, "alternatives": others})
 
-    def with_truth(self, truth: Mapping[str, float]) -> "EstimateRecord":
+    def with_truth(self, truth: Mapping[str, float]) -> EstimateRecord:
         """A copy with true values by name, also for derived moduli and the alternatives.
 
         Unknowns without an entry stay as they are.

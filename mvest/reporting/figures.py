@@ -6,6 +6,8 @@ marker, and colour maps are perceptually uniform. Nothing here touches matplotli
 needs a display.
 """
 
+from __future__ import annotations
+
 import io
 import re
 import textwrap
@@ -140,7 +142,7 @@ def levels(n: int) -> Any:
     return colormaps["viridis"](np.linspace(0.0, 0.85, n))
 
 
-def iterates_figure(estimates: "Sequence[EstimateRecord]") -> Figure | None:
+def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
     """Each parameter over the iterations, in a panel each; None if no estimate has iterates.
 
     A single estimate has a band of two standard deviations. The dashed line is the truth.

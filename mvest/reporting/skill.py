@@ -3,6 +3,8 @@
 The generic guess is the literature's value; the prior is this value with its interval.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -213,7 +215,7 @@ def verdict_table(estimates: Sequence[EstimateRecord]) -> Table:
     return skill_table("verdict", groups)
 
 
-def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> "Figure":
+def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure:
     """Estimates over their truths with 95 % intervals, in the colour of their verdicts.
 
     Each modulus has a panel, and each group a band in which truths rise downwards.

@@ -6,6 +6,8 @@ truth. Files for programs (CSV, JSON) hold every column unrounded. Texts for rea
 LaTeX) are rounded and show a value and its uncertainty in one cell.
 """
 
+from __future__ import annotations
+
 import math
 from collections import ChainMap
 from collections.abc import Iterable, Mapping, Sequence
@@ -67,7 +69,7 @@ class Table:
         ]
 
     @property
-    def frame(self) -> "DataFrame":
+    def frame(self) -> DataFrame:
         """The table as a data frame; missing numbers are NaN."""
         import pandas as pd
 
@@ -130,7 +132,7 @@ class Table:
         return {"columns": about, "values": {k: list(v) for k, v in self.values.items()}}
 
     @classmethod
-    def of_plain(cls, data: Mapping[str, Any], where: str) -> "Table":
+    def of_plain(cls, data: Mapping[str, Any], where: str) -> Table:
         """A table from plain data; an InputError names ``where`` if they are no table."""
         try:
             columns = {name: Column(**about) for name, about in data["columns"].items()}
@@ -166,7 +168,7 @@ class Table:
         return text
 
 
-def table(rows: "Iterable[Any] | DataFrame", **columns: Column | str) -> Table:
+def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
     """A table from a data frame, or from rows that are mappings or dataclasses.
 
     InputError if there are rows without a named column, or without one that belongs to it.
@@ -214,7 +216,7 @@ def _one_line(text: str) -> str:
     return shown_text(" ".join(text.split()))
 
 
-def _plain_rows(rows: "Iterable[Any] | DataFrame") -> list[dict[str, Any]]:
+def _plain_rows(rows: Iterable[Any] | DataFrame) -> list[dict[str, Any]]:
     given: Iterable[Any] = rows.to_dict("records") if hasattr(rows, "to_dict") else rows
     plain = (asdict(row) if is_dataclass(row) else row for row in given)  # type: ignore[arg-type]
     return [{str(name): _plain(value) for name, value in row.items()} for row in plain]

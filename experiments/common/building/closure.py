@@ -1,5 +1,7 @@
 """The configured anatomy, the template's or that of a case folder, and the model of its closure."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -80,7 +82,7 @@ def template_of(config: Values) -> Template:
 
 
 @cache
-def _of_folder(folder: str, _sha256: str | None, contraction: float) -> "GivenValve":
+def _of_folder(folder: str, _sha256: str | None, contraction: float) -> GivenValve:
     """The anatomy of a case; read once while its files do not change."""
     # The reader of cases is as large as everything that Table 1 needs of the valve.
     from mvest.cases.folder import read_case

@@ -1,5 +1,7 @@
 """The gate of an anatomy (`mvest.closure.robustness`), and one closure with every step recorded."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -126,7 +128,7 @@ class Closing:
         share = contact.reference_distance + contact.activation_distance
         return 0.5 * share * float(surface.thickness.mean())
 
-    def ends(self) -> "Closing":
+    def ends(self) -> Closing:
         """The same with the open and the last state only."""
         whole = self.result.simulation
         two = replace(whole, times=whole.times[[0, -1]], frames=whole.frames[[0, -1]])

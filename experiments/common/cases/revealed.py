@@ -1,5 +1,7 @@
 """Virtual patients with a known truth: blind estimates, their verdicts and errors by group."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -92,7 +94,7 @@ def verdicts_and_skill(by: str, groups: Groups, *, stated: bool = True) -> Table
     return table(rows, **skill.columns)
 
 
-def groups_figure(groups: Groups) -> "Figure":
+def groups_figure(groups: Groups) -> Figure:
     """Moduli against their truths, a band for each group."""
     return moduli_figure(
         {

@@ -3,6 +3,8 @@
 A study returns a `Result`; the runner adds the rest of the record once.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -65,7 +67,7 @@ class Mesh(Frozen):
     truth_sha256: str | None = None
 
     @classmethod
-    def of(cls, mesh: "SolidMesh", truth: "SolidMesh | None" = None) -> "Mesh":
+    def of(cls, mesh: SolidMesh, truth: SolidMesh | None = None) -> Mesh:
         """The record of a mesh, and of the truth's mesh."""
         return cls(
             sha256=mesh.sha256,

@@ -5,6 +5,8 @@ programs), ``NAME.md`` (the page for readers), ``NAME.png`` and ``NAME_PART.png`
 for the paper's own tables, LaTeX and PDF.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +51,7 @@ def write_page(
     summary: Mapping[str, Table] | None,
     records: Sequence[Record],
     *,
-    figures: "Mapping[str, Figure]",
+    figures: Mapping[str, Figure],
     captions: Mapping[str, str],
     latex: Collection[str],
 ) -> list[Path]:

@@ -1,5 +1,7 @@
 """Trains the detectors of valves in echo volumes and measures their errors."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -238,7 +240,7 @@ def result_of(
     )
 
 
-def tables_of(trials: "DataFrame", covered: Sequence[Row]) -> dict[str, Table]:
+def tables_of(trials: DataFrame, covered: Sequence[Row]) -> dict[str, Table]:
     """The tables of a test, with the meaning of their columns (`COLUMNS`)."""
     tables = {
         "": table(kind_rows(trials)),
@@ -254,7 +256,7 @@ def tables_of(trials: "DataFrame", covered: Sequence[Row]) -> dict[str, Table]:
 
 def judge(
     rows: Sequence[Row], min_confidence: float, wrong_mm: float, like_from: float
-) -> "DataFrame":
+) -> DataFrame:
     """Rows of trials; whether each is detected as a valve, correct, and unlike the training data.
 
     A valve is correct if its mean point error is below ``wrong_mm``. A volume is unlike the
@@ -274,7 +276,7 @@ def judge(
     )
 
 
-def kind_rows(trials: "DataFrame") -> "DataFrame":
+def kind_rows(trials: DataFrame) -> DataFrame:
     """A row for each kind of volume: detector confidence and fractions of correct detections.
 
     A valve is lost if nothing or something else is detected.
@@ -294,7 +296,7 @@ def kind_rows(trials: "DataFrame") -> "DataFrame":
     return rows.join(kinds[["lost", "unlike"]].sum()).join(kinds[shares].mean()).reset_index()
 
 
-def error_rows(trials: "DataFrame") -> "DataFrame":
+def error_rows(trials: DataFrame) -> DataFrame:
     """Mean, median and 90th percentile of absolute errors of detected valves, by kind."""
     found = trials[trials["called"] & trials["kind"].isin([*VOLUMES, *TESTED])]
     errors = found.melt("kind", list(ERRORS), "error", "size").dropna(subset="size")
@@ -305,7 +307,7 @@ def error_rows(trials: "DataFrame") -> "DataFrame":
     return plain.assign(unit=plain["error"].map(ERRORS))
 
 
-def figure(results: Results) -> "Figure | None":
+def figure(results: Results) -> Figure | None:
     """Confidence and surface distance in every volume; None if the run only trained."""
     from mvest.reporting.figures import COLOURS, SMALL, headline, log_axis, panels
 

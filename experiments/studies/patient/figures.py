@@ -1,5 +1,7 @@
 """Figure 3 of the virtual patients, and ranks of the truth in each scenario's posteriors."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -28,7 +30,7 @@ LEAFLETS = ("#2b6ca3", "#c8452f")
 """Colours of the moduli."""
 
 
-def figure_3(fields: "Mapping[str, CaseFields]", denied: Sequence[str] = ()) -> "Figure":
+def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Figure:
     """The closed valves seen from the atrium, generic above personalised, on one scale.
 
     InputError if a patient's distances are missing.
@@ -77,7 +79,7 @@ def figure_3(fields: "Mapping[str, CaseFields]", denied: Sequence[str] = ()) -> 
     return drawn
 
 
-def _closed(valve: "CaseFields", which: str) -> tuple[FloatArray, FloatArray]:
+def _closed(valve: CaseFields, which: str) -> tuple[FloatArray, FloatArray]:
     """A model's closed positions and distances."""
     positions, distance = getattr(valve, which), getattr(valve, f"distance_{which}")
     if positions is None or distance is None:
@@ -85,7 +87,7 @@ def _closed(valve: "CaseFields", which: str) -> tuple[FloatArray, FloatArray]:
     return positions[valve.closed], distance[valve.closed]
 
 
-def ranks_figure(scenarios: Groups) -> "Figure":
+def ranks_figure(scenarios: Groups) -> Figure:
     """Ranks of the truth in the posterior, one panel per scenario.
 
     Each panel shows the empirical minus the uniform distribution function of the ranks, with the

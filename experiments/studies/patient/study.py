@@ -6,6 +6,8 @@ patients. ``calibration`` does the same for misspecification scenarios; each vio
 of the estimator, so the counts show what a verdict is worth.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -356,7 +358,7 @@ def _with_nees(skill: Table, patients: Patients) -> Table:
 
 
 # -- figures --------------------------------------------------------------------------------------
-def figure(results: Results) -> "dict[str, Figure]":
+def figure(results: Results) -> dict[str, Figure]:
     """Figure 3, or the figure of the population or of the scenarios."""
     patients = _patients(results)
     if results.first.table == POPULATION:

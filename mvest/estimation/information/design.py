@@ -7,6 +7,8 @@ with Tᵀ T = (W H D)ᵀ (W H D) for noise of unit standard deviation, D = diag(
 deviations are relative.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -35,7 +37,7 @@ class Design:
     @classmethod
     def of(
         cls, H: FloatArray, R: NoiseCovariance, values: FloatArray, names: Sequence[str]
-    ) -> "Design":
+    ) -> Design:
         """The design of Jacobian H (n, p) and noise covariance R at unit standard deviation."""
         require_positive(values, "a value of a design")
         return cls(tuple(names), values, _triangle(observation_noise(R, len(H)).whiten(H) * values))

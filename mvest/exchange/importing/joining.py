@@ -6,6 +6,8 @@ the free edges part; a strip of triangles joins them there. The band is then rem
 coordinate lines, with triangles of equal size.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -66,7 +68,7 @@ class Leaflet:
     holes: int
 
     @classmethod
-    def of(cls, vertices: FloatArray, triangles: IntArray) -> "Leaflet":
+    def of(cls, vertices: FloatArray, triangles: IntArray) -> Leaflet:
         """The largest piece of a surface, with merged vertices and closed holes.
 
         GeometryError if the piece is closed, not a manifold, or has a second long boundary.

@@ -8,6 +8,8 @@ use the axes that they name (``SPACE=LPS``), or RAS as before Slicer 4.11. Table
 same origin. Here everything is LPS in mm.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -85,7 +87,7 @@ class _File:
         named = [name for name, words in WORDS.items() if words & (self.words | self.segment)]
         self.leaflet = "" if len(named) != 1 or self.words & NO_LEAFLET else named[0]
 
-    def fits(self, other: "_File") -> bool:
+    def fits(self, other: _File) -> bool:
         """Whether its name agrees with the scene, frame and phase of a surface."""
         pairs = ((self.scene, other.scene), (self.frame, other.frame))
         named = self.valve.lower() in ("", "mitral") and self.phase in ("", other.phase)

@@ -5,6 +5,8 @@ steerable features of Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008), wit
 and their differences as those of Haar.
 """
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import numba as nb
@@ -164,7 +166,7 @@ class SamplePattern(NamedTuple):
     @classmethod
     def paired(
         cls, offsets: FloatArray, levels: IntArray, differences: int, seed: int
-    ) -> "SamplePattern":
+    ) -> SamplePattern:
         """Samples with differences of random pairs, mostly of near ones."""
         rng = np.random.default_rng(seed)
         n = len(offsets)

@@ -1,5 +1,7 @@
 """Position, orientation and size of a valve."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +26,7 @@ class Poses:
     def __len__(self) -> int:
         return len(self.centre)
 
-    def __getitem__(self, which: slice | IntArray | BoolArray | list[int]) -> "Poses":
+    def __getitem__(self, which: slice | IntArray | BoolArray | list[int]) -> Poses:
         return Poses(self.centre[which], self.rotation[which], self.log_scale[which])
 
     @property
@@ -41,7 +43,7 @@ class Poses:
         scale = np.exp(-self.log_scale)[:, None, None]
         return np.asarray((points - self.centre[:, None]) @ self.rotation * scale)
 
-    def moved(self, by: FloatArray) -> "Poses":
+    def moved(self, by: FloatArray) -> Poses:
         """Moved by ``(P, 7)``: shift (mm) and turn (rotation vector) in valve axes, log scale."""
         turn = Rotation.from_rotvec(by[:, 3:6]).as_matrix()
         return Poses(
@@ -50,14 +52,14 @@ class Poses:
             self.log_scale + by[:, 6],
         )
 
-    def towards(self, other: "Poses") -> FloatArray:
+    def towards(self, other: Poses) -> FloatArray:
         """The ``(P, 7)`` that move these poses to ``other``."""
         shift = np.einsum("pij,pi->pj", self.rotation, other.centre - self.centre)
         turn = Rotation.from_matrix(np.swapaxes(self.rotation, 1, 2) @ other.rotation).as_rotvec()
         scale = other.log_scale - self.log_scale
         return np.concatenate([shift, turn, scale[:, None]], axis=1)
 
-    def repeated(self, count: int) -> "Poses":
+    def repeated(self, count: int) -> Poses:
         """Every pose ``count`` times, one after another."""
         return Poses(
             *(np.repeat(v, count, 0) for v in (self.centre, self.rotation, self.log_scale))
@@ -76,7 +78,7 @@ class Poses:
         return np.array(kept, dtype=np.int64)
 
     @staticmethod
-    def joined(parts: "list[Poses]") -> "Poses":
+    def joined(parts: list[Poses]) -> Poses:
         """The poses of all parts."""
         names = ("centre", "rotation", "log_scale")
         return Poses(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))

@@ -9,6 +9,8 @@ prior (maximum a posteriori), repeated with small weights for outliers. A smooth
 vertices then represents what the modes cannot.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -103,14 +105,14 @@ class Pulls(NamedTuple):
     std: FloatArray  #: (m,) mm
 
     @classmethod
-    def joined(cls, parts: "Sequence[Pulls]") -> "Pulls":
+    def joined(cls, parts: Sequence[Pulls]) -> Pulls:
         """The pulls of all parts."""
         return cls(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
     @classmethod
     def to_points(
         cls, vertex: IntArray, now: FloatArray, points: FloatArray, std: FloatArray
-    ) -> "Pulls":
+    ) -> Pulls:
         """To points ``(m, 3)`` mm, along all three axes of the world."""
         return cls(
             np.repeat(vertex, 3),
@@ -196,13 +198,13 @@ class LabelledFrame(NamedTuple):
     model: ShapeModel
     rng: np.random.Generator  #: draws the examples
 
-    def missed_poses(self, misses: "Misses", count: int) -> Poses:
+    def missed_poses(self, misses: Misses, count: int) -> Poses:
         """``count`` poses about the true one."""
         shift, turn, scale, _ = misses
         std = [shift] * 3 + [np.deg2rad(turn)] * 3 + [scale]
         return self.pose.repeated(count).moved(self.rng.standard_normal((count, 7)) * std)
 
-    def missed_shapes(self, misses: "Misses", count: int) -> FloatArray:
+    def missed_shapes(self, misses: Misses, count: int) -> FloatArray:
         """``count`` shapes ``(count, n, 3)`` mm about the true one."""
         poses, std = self.missed_poses(misses, count), self.model.std
         exact = self.model.coefficients(self.pose.local(self.vertices[None]))

@@ -1,5 +1,7 @@
 """A trained model: all detectors with their shape model, as one file."""
 
+from __future__ import annotations
+
 import hashlib
 import io
 import json
@@ -68,7 +70,7 @@ class DetectionAccuracy:
     shapes: FloatArray | None = None  #: (S, F, n, 3) mm, detected valves, each in its own axes
     tip_shapes: FloatArray | None = None  #: (S, F, 2, 3) mm
 
-    def at(self, confidence: float) -> "DetectionAccuracy":
+    def at(self, confidence: float) -> DetectionAccuracy:
         """Errors in a volume of some confidence: the lower, the wider about their mean."""
         factor = self.factor(confidence)
         mean, tip_mean = self.samples.mean(axis=0), self.tip_samples.mean(axis=0)

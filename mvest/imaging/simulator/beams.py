@@ -6,6 +6,8 @@ function, which is separable in distance and the two angles (linear image format
 al., IEEE Trans. Ultrason. Ferroelectr. Freq. Control 56, 2009).
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -245,7 +247,7 @@ class BeamGrid:
     distance: Axis  #: mm
 
     @classmethod
-    def of(cls, a: Acquisition) -> "BeamGrid":
+    def of(cls, a: Acquisition) -> BeamGrid:
         """The grid that resolves an acquisition's point spread function."""
         half_a, half_e = math.radians(a.azimuth_deg) / 2, math.radians(a.elevation_span_deg) / 2
         lateral, elevation = math.radians(a.lateral_deg), math.radians(a.elevation_deg)

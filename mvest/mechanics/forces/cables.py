@@ -22,6 +22,8 @@ Ties are stiff springs between pairs of material points, as in an edge-to-edge c
 The points can rotate about each other freely. With :math:`L = 0` the spring is linear.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -235,7 +237,7 @@ class TiedPoints:
             )
         require_numbers(self, "ties", "length", "stiffness")
 
-    def within(self, mesh: SolidMesh) -> "Ties":
+    def within(self, mesh: SolidMesh) -> Ties:
         """The same as springs between points of a mesh."""
         first, second = embed(mesh, self.first), embed(mesh, self.second)
         spans = Embedding(

@@ -17,6 +17,8 @@ same positions give the same forces to the last bit. A tree's Hessian is elimina
 leaflets to the tip, one 3 x 3 block per junction.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numba as nb
@@ -47,7 +49,7 @@ class Trees:
     pairs: IntArray
 
     @classmethod
-    def of(cls, parent: IntArray, rest_length: FloatArray, c: int) -> "Trees":
+    def of(cls, parent: IntArray, rest_length: FloatArray, c: int) -> Trees:
         """Trees with c leaflet ends from ``parent`` and ``rest_length (k,)`` mm."""
         on = paths(parent, c)
         root = np.array([int(np.flatnonzero(row & (parent < 0))[0]) for row in on], dtype=np.int64)

@@ -1,5 +1,7 @@
 """Figures of one case: shapes, distances and intervals."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -90,7 +92,7 @@ def _views_figure(
     return figure, grid
 
 
-def frames_figure(case: "ValveCase", reach_mm: float) -> Figure:
+def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
     """The frames of a case as given, from two sides.
 
     ``reach_mm``: distance of midsurfaces within which leaflets touch. The closed frame shows its

@@ -4,6 +4,8 @@ All lengths are millimetres. Every object is frozen and checked on construction;
 failed check names the field and the entry.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
@@ -247,7 +249,7 @@ class Chordae:
         start = np.where(branches, points[self.parent + len(self.insertion)], tips[self.tip])
         return np.stack([start, points], axis=1)
 
-    def moved(self, tips: FloatArray, ends: FloatArray) -> "Chordae":
+    def moved(self, tips: FloatArray, ends: FloatArray) -> Chordae:
         """The chordae with other tips and leaflet ends; their junctions follow proportionally.
 
         A junction moves with its tip and the mean of the leaflet ends beyond it, each weighted by

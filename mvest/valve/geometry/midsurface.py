@@ -7,6 +7,8 @@ sheet of the tissue. Near the edges, where the nearest wall is the rim, the thic
 the tissue farther in.
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -68,7 +70,7 @@ class Midsurface:
         grid = self.vertices.reshape(-1, len(self.annulus), 3)
         return np.asarray(_arc_lengths(grid)[-1].reshape(2, -1).max(axis=1))
 
-    def exchanged(self) -> "Midsurface":
+    def exchanged(self) -> Midsurface:
         """The same surface with anterior and posterior leaflets swapped."""
         columns = len(self.annulus)
 
@@ -78,7 +80,7 @@ class Midsurface:
 
         return replace(self, vertices=turned(self.vertices), thickness=turned(self.thickness))
 
-    def smoothed(self, width_mm: float) -> "tuple[Midsurface, float]":
+    def smoothed(self, width_mm: float) -> tuple[Midsurface, float]:
         """Smooth the surface around the valve; also return the largest move (mm) of a vertex.
 
         The Gaussian weights have the standard deviation `width_mm` along the annulus, and

@@ -6,6 +6,8 @@ host element and shape-function weights, so that its position is ``weights @ nod
 any state.
 """
 
+from __future__ import annotations
+
 import hashlib
 from dataclasses import dataclass
 
@@ -123,11 +125,11 @@ class Embedding:
         flat = _weighted_sums(self.nodes, self.weights, values.reshape(len(values), -1))
         return flat.reshape(len(self.nodes), *values.shape[1:])
 
-    def take(self, rows: IntArray) -> "Embedding":
+    def take(self, rows: IntArray) -> Embedding:
         """Some of the points, in this order."""
         return Embedding(self.nodes[rows], self.weights[rows], self.host[rows])
 
-    def average(self, coefficients: FloatArray, groups: IntArray) -> "Embedding":
+    def average(self, coefficients: FloatArray, groups: IntArray) -> Embedding:
         """Weighted averages of the points.
 
         Parameters
