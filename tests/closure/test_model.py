@@ -36,7 +36,7 @@ GENTLE = ClosureProtocol(pressure_mmHg=0.5, ramp=0.1, dt=0.05, end=0.1)
 EXACT = NewtonSettings(tolerance=1e-13, smallest_move=1e-11, max_iterations=60)
 
 TEMPLATE = Template()
-SMALL = {"cells": (10, 2), "samples": (32, 8)}
+SMALL = {"cells": (12, 2), "samples": (32, 8)}
 TINY = {"cells": (8, 1), "samples": (16, 5)}
 
 
