@@ -127,7 +127,7 @@ CURVES = {
 
 
 def figure(results: Results) -> Figure | None:
-    """Four moments of a closing valve from the atrium and from the side, and its measures."""
+    """Four moments of a closing valve from the atrium, the side and in section; its measures."""
     name, record = next(iter(results.records.items()))
     if name not in results.arrays:
         return None
@@ -141,13 +141,13 @@ def figure(results: Results) -> Figure | None:
         + f", {values['pressure'][k]:.0f} mmHg"
         for k in moments
     }
-    drawn = Figure(figsize=(11, 8.4), layout="constrained")
-    parts: Any = drawn.subfigures(2, 1, height_ratios=[2.2, 1.0])
+    drawn = Figure(figsize=(11, 10.4), layout="constrained")
+    parts: Any = drawn.subfigures(2, 1, height_ratios=[3.0, 1.0])
     draw_closing(parts[0], results.arrays[name], titles)
     _draw_curves(parts[1], values, moments, at_rest)
     drawn.suptitle(
-        "A simulated valve closing, from the atrium and from the posterior side"
-        " (dots: the moments shown)",
+        "A simulated valve closing, from the atrium, from the posterior side and in the middle"
+        " section (dots: the moments shown)",
         fontsize=11,
     )
     return drawn

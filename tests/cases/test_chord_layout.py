@@ -112,6 +112,11 @@ def test_fans_branch_on_the_way_from_the_tip_to_their_middle():
     over_open = (chordae.along(chordae.rest_length) / chordae.along(lengths[0]))[[0, 1, 3, 4]]
     assert over_open.reshape(2, 2).min(axis=1) == pytest.approx([1.1, 1.1], rel=1e-12)
     assert chordae.axial_stiffness.tolist() == [20, 20, 16, 20, 20, 16, 40, 40]
+    # Branches of a fan across the middle start at the tip that is nearer to its middle.
+    across = replace(layout, marginal=(84.0,), fan_width=24.0)
+    tip = lay_out_chordae(band, tips, closed, tips - lower, across).tip
+    assert tip[[0, 1, 6]].tolist() == [1, 1, 1]
+    assert tip[[3, 4, 7]].tolist() == [0, 0, 0]
 
 
 @pytest.fixture

@@ -32,6 +32,7 @@ from mvest.scenarios.measures import contact_pressure, measure_steps
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.valve import band_grid
+from mvest.valve.geometry.proximity import plane_section
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.solid_mesh import embed
 
@@ -206,13 +207,17 @@ def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
 
 
 def draw_closing(part: Any, path: Path, steps: Mapping[int, str]) -> None:
-    """Draw some steps of a closure from the atrium and from the posterior side.
+    """Draw some steps of a closure from the atrium, from the posterior side and in section.
+
+    The section is the plane x = 0 through the middles of both leaflets.
 
     ``part`` is a figure or part of one, ``path`` an ``.npz`` file with `Closing.arrays`. ``steps``
     maps numbers of steps to titles; the open orifice of the last one is painted.
 
     Raises an `InputError` if the file cannot be read.
     """
+    from matplotlib.collections import LineCollection
+
     from mvest.problem.fields import case_fields
     from mvest.reporting.case import drawing
     from mvest.reporting.figures import ATRIUM, View
@@ -232,10 +237,16 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str]) -> None:
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path}: no arrays of a closing valve ({error})") from error
     posterior = View("seen from the posterior side", 8.0, -90.0)
-    panels = part.subplots(2, len(steps), height_ratios=[1.0, 1.35], squeeze=False)
+    panels = part.subplots(3, len(steps), height_ratios=[1.0, 1.35, 0.9], squeeze=False)
     colours, last = drawing.leaflet_colours(valve.region), len(shapes) - 1
     for column, (k, title) in zip(panels.T, steps.items(), strict=True):
-        for view, axes in zip((ATRIUM, posterior), column, strict=True):
+        for region in range(len(names)):
+            triangles = valve.triangles[valve.region == region]
+            cut, _ = plane_section(shapes[k], triangles, np.zeros(3), np.array([1.0, 0.0, 0.0]))
+            colour = colours[np.argmax(valve.region == region), 0]
+            column[2].add_collection(LineCollection(cut[..., 1:], colors=[colour], linewidths=2))
+        column[2].set_axis_off()
+        for view, axes in zip((ATRIUM, posterior), column[:2], strict=True):
             shown = view is posterior
             drawing.draw_valve(axes, valve, shapes[k], colours, view, k, chords=shown)
         column[0].set_title(title, fontsize=10)
@@ -244,3 +255,5 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str]) -> None:
     drawn = [shapes[k] for k in steps]
     drawing.same_scale(list(panels[0]), drawn, ATRIUM)
     drawing.same_scale(list(panels[1]), [*drawn, *(valve.tips[k] for k in steps)], posterior)
+    for axes in panels[2]:
+        axes.set(aspect="equal", xlim=(-16.0, 16.0), ylim=(-20.0, 8.0))

@@ -290,7 +290,7 @@ class Template:
         trunks: list[tuple[int, int]] = []
         for tip in (0, 1):
             for family, own in groups:
-                at = np.array([180.0 - phi if tip else phi for phi, _ in own])
+                at = np.array([180.0 - angle if tip else angle for angle, _ in own])
                 here = np.ones(len(own), dtype=np.bool_)
                 for start, end in layout.absent:
                     here &= ~_between(at, start, end)
@@ -298,17 +298,18 @@ class Template:
                 if parent >= 0:
                     trunks.append((family, tip))
                 left = zip(at[here], np.array(own)[here, 1], strict=True)
-                ends += [(phi, s, family, tip, parent) for phi, s in left]
+                ends += [(angle, place, family, tip, parent) for angle, place in left]
         if not ends:
             raise InputError(f"chordae absent at {layout.absent}: none is left")
-        phi, s, family, tip, parent = map(np.array, zip(*ends, strict=True))
+        phi, s, *rest = map(np.array, zip(*ends, strict=True))
+        families, tips, parents = rest
         above = np.array(trunks, dtype=np.int64).reshape(-1, 2)
         return ChordPlaces(
             phi,
             s,
-            np.concatenate([family, above[:, 0]]),
-            np.concatenate([tip, above[:, 1]]),
-            np.concatenate([parent, np.full(len(above), -1)]),
+            np.concatenate([families, above[:, 0]]),
+            np.concatenate([tips, above[:, 1]]),
+            np.concatenate([parents, np.full(len(above), -1)]),
         )
 
     def chordae(self) -> Chordae:
