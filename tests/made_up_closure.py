@@ -21,11 +21,20 @@ from mvest.personalisation import PersonaliseSettings, Prior
 from mvest.personalisation.geometry import GeometryModes
 from mvest.personalisation.sources import LAW, ErrorSource
 from mvest.problem.registration import REGISTRATION, displace
+from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
 
 COLUMNS, ROWS = 32, 9
-TEMPLATE = Template()
+WIDE = {
+    "leaflets.posterior.length": 20.0,
+    "leaflets.indentation": 0.0,
+    "leaflets.scallop_bulge": 0.0,
+    "free_edge.posterior_opening": 8.0,
+}
+"""A valve for a smooth formula, which closes no narrow orifice and bends no short leaflet."""
+
+TEMPLATE = Template(TemplateParameters().changed(WIDE))
 VALVE = TEMPLATE.valve(COLUMNS, ROWS)
 MESH = structured_mesh(TEMPLATE, "hex18", 8, 1)
 TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
@@ -78,7 +87,7 @@ def _fields() -> dict[str, np.ndarray]:
     up = np.array([0.0, 0.0, 1.0])
     return {
         "E_f.anterior": np.outer(belly * (phi < np.pi), up),
-        "E_f.posterior": np.outer(belly * (phi > np.pi), up),
+        "E_f.posterior": np.outer(0.5 * belly * (phi > np.pi), up),
         "stretch": np.outer(s**2 * np.cos(phi) ** 2, -up),
         "loose": np.outer(s * (1 - s) * np.cos(phi), np.array([0.0, 1.0, 0.5])),
         "length": np.outer(s**3, np.array([0.3, 1.0, -1.0])),

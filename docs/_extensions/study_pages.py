@@ -20,6 +20,13 @@ if TYPE_CHECKING:
 ELSEWHERE = ("dashboard",)
 """Pictures shown on other pages."""
 
+EARLIER = (
+    "Results of the default valve and of the anatomies made from it are of the earlier default "
+    "valve, without scallops and with straight chordae, until they are run anew."
+)
+PRESENT = ("table1", "models", "shells", "strip", "donor", "reference_heart")
+"""Pages whose results are of the present default valve, or of no such valve."""
+
 LAST = "Further studies"
 """The group of pages without notes."""
 
@@ -160,6 +167,8 @@ def text_of(page: Page, results: Path) -> str:
         rows = [f"    {experiment.command}" for experiment in page.experiments]
         parts += ["## Run it", "\n".join(rows)]
     parts.append("## Results")
+    if page.name not in PRESENT:
+        parts.append(EARLIER)
     tables = [(results / f"{stem}.md") for stem in page.tables]
     shown = {found[2] for path in tables for found in PICTURE.finditer(path.read_text("utf-8"))}
     parts += [picture_text(stem) for stem in page.pictures if stem not in shown]
@@ -188,6 +197,7 @@ def index_of(pages: list[Page]) -> str:
         "Each page has the question of a study, the command that repeats it, and its tables and "
         "figures from `results/`, with commit and configuration. Everything is simulated, except "
         "the donor valve and the shape of the reference heart.",
+        EARLIER,
     ]
     for group in dict.fromkeys(page.group for page in pages):
         members = [page for page in pages if page.group == group]

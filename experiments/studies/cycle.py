@@ -1,7 +1,7 @@
 """Information in the frames of a whole cycle, time step errors, and estimates from the frames.
 
 All results come from one simulated cycle of a valve with known parameters. The experiments `cycle`,
-`joint`, `joint_open` and `chord` differ in their unknowns and estimates.
+`joint` and `chord` differ in their unknowns and estimates.
 """
 
 from __future__ import annotations

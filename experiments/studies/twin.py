@@ -189,11 +189,10 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
         "distance mean": Column("mm", std="distance SD", label="distance"),
         "distance SD": Column("mm"),
         **dict.fromkeys(("source", "status", "reason"), Column(hidden=True)),
-        "tenting": Column("mm"),
     }
-    for name in rows[-1]:
-        if name.startswith(("median strain", "99 % stress")):
-            about[name] = Column("MPa" if "stress" in name else "%")
+    measured = {"tenting": "mm", "median strain": "%", "99 % stress": "MPa"}
+    for start, unit in measured.items():
+        about |= {name: Column(unit) for name in rows[-1] if name.startswith(start)}
     return table(rows, **about)
 
 

@@ -20,8 +20,8 @@ TINY = (
     # The paper's damping: steps this long fail with less, and cost seconds until they are halved.
     "mechanics.damping.beta=0.1",
     "cycle.protocol.times=[0.0,0.05,0.1,0.15,0.25]",
-    "cycle.finer=[10,1,20,5]",
-    "cycle.check=[12,1,24,5]",
+    "cycle.finer=[12,1,24,5]",
+    "cycle.check=[16,1,24,5]",
     "cycle.seeds=2",
     # What moves so little says little in 0.5 mm of noise.
     "cycle.noise_mm=0.01",

@@ -122,9 +122,9 @@ def test_each_case_changes_its_own_setting_only():
 
 
 def test_the_gate_study_records_every_case(run):
-    status, record, folder, said = run("experiment=gate", *ONE, "valve=half_open")
+    status, record, folder, said = run("experiment=gate", *ONE, "valve=normal_small")
     assert status == 0
-    assert (record.status, record.row) == ("converged", "half_open")
+    assert (record.status, record.row) == ("converged", "normal_small")
     rows = record.table_of("variations").rows
     names = ["reference", *(c.name for c in GATE_CASES)]
     paths = [f"along {name}" for name in ("E_f", "E_f.anterior", "E_f.posterior")]

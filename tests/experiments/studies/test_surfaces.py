@@ -56,12 +56,13 @@ def laid_out_by(kind):
 
 
 # Half a thickness is 0.6 mm, the shift to LPS 144 mm; 0.3 mm to one side are less off a surface.
+# Triangles 2 mm wide lie 0.1 mm within scallops that bend with a radius of 5 mm.
 @pytest.mark.parametrize(
     ("kind", "corresponds", "opened_mm", "closed_mm"),
     [
         ("surfaces", False, (0.0, 1e-9), (0.0, 1e-9)),
         ("with errors", False, (0.0, 1e-9), (0.05, 0.3)),
-        ("slicerheart", False, (0.0, 0.06), (0.0, 0.06)),
+        ("slicerheart", False, (0.0, 0.1), (0.0, 0.1)),
         pytest.param("labels", False, (0.02, 0.2), (0.0, 1e-5), marks=pytest.mark.slow),
         pytest.param("closed", False, (0.02, 0.2), (0.02, 0.2), marks=pytest.mark.slow),
     ],

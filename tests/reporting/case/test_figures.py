@@ -14,11 +14,14 @@ from mvest.reporting.case.drawing import (
 from mvest.reporting.case.figures import case_figure, estimates_figure, frames_figure, shapes_figure
 from mvest.reporting.case.view import states_of
 from mvest.reporting.figures import ATRIUM, SIDE
-from tests.closure.branching import STRAIGHT, branched
-from tests.made_up_closure import VALVE
+from mvest.valve.anatomy.template import Template
+from tests.closure.branching import branching
+from tests.made_up_closure import TEMPLATE, VALVE
 from tests.made_up_closure import made_up_case as case_of_frames
 from tests.reporting.case.made_up_case import COLUMNS, made_up_case
 
+STRAIGHT = Template(TEMPLATE.parameters.changed({"chordae.branches": 1})).chordae()
+BRANCHED = branching(STRAIGHT, VALVE.papillary_tips)
 NAMES = ("anterior", "posterior")
 LINES = 2 * COLUMNS * LINE_PIECES
 """Pieces of the annulus and of the free edge."""
@@ -134,7 +137,7 @@ def test_every_frame_of_a_case_is_drawn_from_two_sides_on_one_scale(corresponds)
 
 def test_branching_chordae_are_drawn_where_they_follow_tips_and_leaflets():
     # Stored with a case, in another frame, and turned as the valve is.
-    valve = branched(VALVE)
+    valve = replace(VALVE, chordae=BRANCHED)
     surface, tips = valve.surface, valve.papillary_tips
     arrays = valve_fields(valve, ["closed"]) | {"tips": np.stack([tips, tips + 1.0])}
     arrays |= as_stored(chord_fields(valve.chordae, surface.vertices))
@@ -159,11 +162,11 @@ def test_branching_chordae_are_drawn_where_they_follow_tips_and_leaflets():
 
 def test_frames_of_a_case_show_all_segments_of_branching_chordae():
     case, counts = case_of_frames(0.3), []
-    for chordae in (STRAIGHT, branched(VALVE).chordae):
+    for chordae in (STRAIGHT, BRANCHED):
         figure = frames_figure(replace(case, chordae=chordae), reach_mm=2.0)
         paths = len(faces(figure.axes[3]).get_paths())
         counts.append(paths - LINE_PIECES * len(chordae))
-    assert len(branched(VALVE).chordae) > len(STRAIGHT)
+    assert len(BRANCHED) > len(STRAIGHT)
     assert counts[0] == counts[1]
 
 

@@ -52,7 +52,7 @@ def test_the_truth_is_made_on_both_meshes(tmp_path: Path) -> None:
     assert source.fine.key != source.coarse.key
 
 
-@pytest.mark.parametrize("coarser", ["[108]", "[162,18]", "[108,10]"])
+@pytest.mark.parametrize("coarser", ["[90]", "[126,14]", "[90,9]"])
 def test_meshes_that_are_no_pair_are_refused(coarser: str) -> None:
     with pytest.raises(ConfigurationError, match="extrapolated_from"):
         build_twin(twin_values(f"truth.extrapolated_from={coarser}"))
