@@ -1,9 +1,7 @@
 """Populations of simulated valves in motion: anatomies, moduli, pressures and timing drawn.
 
 Every valve has its own random stream, spawned from the seed. So it does not depend on the number of
-processes or on how often another valve was drawn again.
-
-A population is stored in one ``.npz`` file without pickled objects.
+processes or on how often another valve was drawn again. They are stored in one ``.npz`` file.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -58,8 +56,7 @@ def draw_population(
 
     The median anatomies (``bases``, by name) are used equally often, in a random order. Durations
     are drawn about that of the settings. A single process is this one. InputError if no valve is
-    requested or no anatomy given, GeometryError if a
-    valve is refused `MAX_DRAWS` times.
+    requested or no anatomy given, GeometryError if a valve is refused `MAX_DRAWS` times.
     """
     if count < 1 or processes < 1 or not bases:
         raise InputError(

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from mvest.cases.folder import read_case, write_case
-from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
+from mvest.cases.tissue import (
+    CLOSED_DEPTH,
+    SEEN_ON_BAND,
+    LeafletBand,
+    assumed_closure,
+    lay_out_chordae,
+)
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.template import BRANCHING, MARGINAL_S, Template
 from mvest.valve.anatomy.valve import band_grid
@@ -117,6 +123,19 @@ def test_fans_branch_on_the_way_from_the_tip_to_their_middle():
     tip = lay_out_chordae(band, tips, closed, tips - lower, across).tip
     assert tip[[0, 1, 6]].tolist() == [1, 1, 1]
     assert tip[[3, 4, 7]].tolist() == [0, 0, 0]
+
+
+def test_chordae_of_a_half_start_at_one_tip_also_where_the_other_is_nearer():
+    valve = Template().valve(40, 12)
+    for tips in (valve.papillary_tips, valve.papillary_tips[::-1]):
+        shifted = tips + np.array([3.0, 0.0, 0.0])
+        chordae = lay_out_chordae(
+            band_of(valve), shifted, valve.surface.vertices, shifted, SEEN_ON_BAND
+        )
+        own = chordae.end_tip
+        np.testing.assert_array_equal(np.sign(chordae.insertion[:, 0]), np.sign(tips[own, 0]))
+        reach = np.linalg.norm(chordae.insertion[:, None] - shifted, axis=2)
+        assert (reach.argmin(axis=1) != own).any()
 
 
 @pytest.fixture

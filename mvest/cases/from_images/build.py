@@ -158,8 +158,8 @@ def case_of_sequence(
         "fibre: around the valve, turned as in the template near the commissures of the anterior "
         "leaflet",
         "annulus and free edge: the first and the last row of the image step's layout",
-        f"chordae: {len(chordae.insertion)} laid out as in the template, each to its nearer "
-        "papillary tip, "
+        f"chordae: {len(chordae.insertion)} leaflet ends laid out as in the template, those of a "
+        "half to its nearer papillary tip, "
         "rest lengths from the closed frame (through its vertices)",
     ]
     return ValveCase(
