@@ -4,8 +4,6 @@ Exit status as in ``experiments.run``: 0 done; 1 no estimate; 2 the request is w
 how); 130, 143 or 129 stopped by Ctrl-C, SIGTERM or SIGHUP.
 """
 
-from __future__ import annotations
-
 import difflib
 import pkgutil
 import re
@@ -28,21 +26,13 @@ WIDTH = 100  # characters of a line of help
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One command of ``mvest``.
+    """One command of ``mvest``."""
 
-    Attributes
-    ----------
-    about, example : str
-        For the help.
-    run : str
-        Full name of a function that returns an exit status, or paths to print.
-    arguments : mapping or None
-        Arguments of the function, see `Parser`; None: it gets the words themselves.
-    """
-
+    #: for the help
     about: str
     example: str
-    run: str
+    run: str  #: full name of a function that returns an exit status, or paths to print
+    #: arguments of the function, see `Parser`; None: it gets the words themselves
     arguments: dict[str, dict[str, Any]] | None = None
 
     def __call__(self, name: str, words: list[str]) -> int:

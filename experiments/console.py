@@ -1,7 +1,5 @@
 """How a command ends: one line if it is refused, or stopped by Ctrl-C, SIGTERM or SIGHUP."""
 
-from __future__ import annotations
-
 import argparse
 import atexit
 import functools

@@ -5,8 +5,6 @@ Importers and exporters are the functions ``import_MODULE`` and ``export_MODULE`
 of options. They need no registration.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil

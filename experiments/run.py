@@ -5,8 +5,6 @@ reason); 2 the request is wrong (one line says how) or nothing can be written; 1
 stopped by Ctrl-C, SIGTERM or SIGHUP (nothing is left half-written).
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 import os

@@ -1,7 +1,5 @@
 """``mvest simulate volume``: a simulated echo volume over time, and its truth next to it."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import time

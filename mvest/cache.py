@@ -103,6 +103,10 @@ def get_or_make(
 
     If several processes need the same entries, the first makes them and the others wait.
 
+    InputError if the cache cannot be written.
+
+    Returns the values as read from the cache, also if they were just made.
+
     Parameters
     ----------
     entries : sequence of Entry
@@ -112,16 +116,6 @@ def get_or_make(
         Writes a value to a path, as a file or as a folder.
     keep : callable
         Whether a value is cached; otherwise it is returned unchanged.
-
-    Returns
-    -------
-    list
-        Values as read from the cache, also if they were just made.
-
-    Raises
-    ------
-    InputError
-        If the cache cannot be written.
     """
     values: list[Any] = [entry.found() for entry in entries]
     left = [k for k, value in enumerate(values) if value is None]
@@ -161,10 +155,7 @@ def source_key(*made_by: Any) -> str:
 def content_digest(*values: Any) -> str:
     """SHA-256 of the content of arrays, dataclasses, mappings, sequences, numbers and texts.
 
-    Raises
-    ------
-    InputError
-        If something is none of these.
+    InputError if something is none of these.
     """
     digest = hashlib.sha256()
     for value in values:

@@ -17,8 +17,6 @@ Conventions
   and Roehl 1994, Int. J. Numer. Meth. Engng 37:2551).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -32,45 +30,27 @@ Evaluate = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Element:
-    """One reference element.
-
-    Attributes
-    ----------
-    name : str
-    n_nodes : int
-    shape : callable
-        ``(q, 3) -> (q, n_nodes)`` shape functions.
-    gradient : callable
-        ``(q, 3) -> (q, n_nodes, 3)`` derivatives with respect to the reference coordinates.
-    points, weights : ndarray
-        Stiffness quadrature, ``(q, 3)`` and ``(q,)``; the weights sum to the reference volume.
-    enhanced : callable
-        ``(q, 3) -> (q, n_modes)`` enhanced thickness-strain modes; ``n_modes`` may be 0.
-    node_coordinates : ndarray
-        ``(n_nodes, 3)`` reference coordinates of the nodes.
-    outside : callable
-        ``(q, 3) -> (q,)`` distance of points outside, in reference coordinates; <= 0 inside.
-    inside : callable
-        ``(q, 3) -> (q, 3)`` a nearby point of the element; an inner point is returned unchanged.
-    face : str
-        Name of the face element of the outer faces (the ``zeta`` faces of layered elements).
-    centre : (1, 3)
-    top_face : ndarray
-        Local nodes of the face at ``zeta = 1`` of layered elements; empty for the others.
-    """
+    """One reference element."""
 
     name: str
     n_nodes: int
-    shape: Evaluate
+    shape: Evaluate  #: ``(q, 3) -> (q, n_nodes)`` shape functions
+    #: ``(q, 3) -> (q, n_nodes, 3)`` derivatives with respect to the reference coordinates
     gradient: Evaluate
+    #: stiffness quadrature, ``(q, 3)`` and ``(q,)``; the weights sum to the reference volume
     points: FloatArray
     weights: FloatArray
+    #: ``(q, 3) -> (q, n_modes)`` enhanced thickness-strain modes; ``n_modes`` may be 0
     enhanced: Evaluate
-    node_coordinates: FloatArray
+    node_coordinates: FloatArray  #: ``(n_nodes, 3)`` reference coordinates of the nodes
+    #: ``(q, 3) -> (q,)`` distance of points outside, in reference coordinates; <= 0 inside
     outside: Evaluate
+    #: ``(q, 3) -> (q, 3)`` a nearby point of the element; an inner point is returned unchanged
     inside: Evaluate
+    #: name of the face element of the outer faces (the ``zeta`` faces of layered elements)
     face: str
-    centre: FloatArray
+    centre: FloatArray  #: (1, 3)
+    #: local nodes of the face at ``zeta = 1`` of layered elements; empty for the others
     top_face: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @property
@@ -81,25 +61,16 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class Face:
-    """One reference face with nodes, quadrature and shape tables.
-
-    Attributes
-    ----------
-    name : str
-    n_nodes : int
-    shape, gradient : (q, n_nodes) and (q, n_nodes, 2)
-        Shape functions and their derivatives at the quadrature points.
-    weights : (q,)
-    corners : (m, 3)
-        Local nodes of triangles that cover the face.
-    """
+    """One reference face with nodes, quadrature and shape tables."""
 
     name: str
     n_nodes: int
+    #: (q, n_nodes) and (q, n_nodes, 2), shape functions and their derivatives at the quadrature
+    #: points
     shape: FloatArray
     gradient: FloatArray
-    weights: FloatArray
-    corners: IntArray
+    weights: FloatArray  #: (q,)
+    corners: IntArray  #: (m, 3), local nodes of triangles that cover the face
 
 
 def _lagrange(order: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:

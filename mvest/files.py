@@ -1,7 +1,5 @@
 """Atomic writing of files and folders, and their digests."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil
@@ -26,6 +24,8 @@ def write_atomically(
     An existing one is replaced. Interruptions leave no partial content, and other processes see
     none.
 
+    Returns ``path``. InputError if it cannot be written.
+
     Parameters
     ----------
     path : Path or str
@@ -35,16 +35,6 @@ def write_atomically(
         which ends as ``path`` does, and makes a file or a folder there.
     sync : bool
         Whether to flush the content to the disk before renaming.
-
-    Returns
-    -------
-    Path
-        ``path``.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
     """
     target = Path(path)
     part = target.with_name(f"{PREFIX}{uuid.uuid4().hex}-{target.name}")

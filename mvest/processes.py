@@ -7,8 +7,6 @@ left the program's process group (prctl(2), child subreaper), and the program di
 is killed. Only the standard library is imported, so a supervisor starts in milliseconds.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import resource
@@ -42,6 +40,8 @@ class Program(AbstractContextManager["Program"]):
     It leads its own session, so that signals of a terminal do not reach it. A context manager ends
     it on exit; otherwise it ends when it is no longer referenced.
 
+    OSError if the program cannot be started.
+
     Parameters
     ----------
     command : sequence of str
@@ -55,11 +55,6 @@ class Program(AbstractContextManager["Program"]):
         The supervisor, with the program's streams and its exit status or signal.
     pid : int
         Number of the program, and of its session and group.
-
-    Raises
-    ------
-    OSError
-        If the program cannot be started.
     """
 
     def __init__(self, command: Sequence[str], **options: Any) -> None:
@@ -133,6 +128,8 @@ def run(
 ) -> subprocess.CompletedProcess[Any]:
     """Run a program as `subprocess.run` does; it never outlives this process.
 
+    OSError if it cannot be started. subprocess.TimeoutExpired if it took longer.
+
     Parameters
     ----------
     command : sequence of str
@@ -142,13 +139,6 @@ def run(
         s; the program is ended after this time.
     **options
         Of `subprocess.Popen`.
-
-    Raises
-    ------
-    OSError
-        If it cannot be started.
-    subprocess.TimeoutExpired
-        If it took longer.
     """
     if input is not None:
         options["stdin"] = subprocess.PIPE

@@ -30,16 +30,11 @@ THREAD_VARIABLES = (
 def provenance(directory: Path | None = None) -> dict[str, Any]:
     """Describe the code and the machine of a computation.
 
-    Parameters
-    ----------
-    directory : Path, optional
-        A folder of the checkout; by default that of this file.
+    Returns a dict: ``git`` (see `git_state`), ``versions`` of packages and ``threads`` by
+    environment variable (None if not installed or unset), ``python``, ``platform``, ``machine`` and
+    ``cpu_count``.
 
-    Returns
-    -------
-    dict
-        ``git`` (see `git_state`), ``versions`` of packages and ``threads`` by environment variable
-        (None if not installed or unset), ``python``, ``platform``, ``machine`` and ``cpu_count``.
+    ``directory``: a folder of the checkout; by default that of this file.
     """
     versions: dict[str, str | None] = dict.fromkeys(KEY_PACKAGES)
     for name in KEY_PACKAGES:
@@ -59,12 +54,9 @@ def provenance(directory: Path | None = None) -> dict[str, Any]:
 def git_state(directory: Path) -> dict[str, Any]:
     """The commit of a folder, and whether its tracked files differ from it.
 
-    Returns
-    -------
-    dict
-        ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file outside ``results/``
-        was changed). Both are None without git, without a commit, or without tracked files in the
-        folder.
+    Returns a dict: ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file outside
+    ``results/`` was changed). Both are None without git, without a commit, or without tracked files
+    in the folder.
     """
     sha = _git(directory, "rev-parse", "--verify", "HEAD")
     # An installation within somebody's checkout does not belong to it.
@@ -98,10 +90,7 @@ def config_hash(config: Mapping[str, Any]) -> str:
 def write_json(path: Path, value: Any) -> None:
     """Write data as JSON, atomically; keys keep their order.
 
-    Raises
-    ------
-    InputError
-        The data have no JSON form, or the file cannot be written.
+    InputError if the data have no JSON form, or the file cannot be written.
     """
     text = json.dumps(_plain(value, "value"), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     write_atomically(path, text, sync=True)

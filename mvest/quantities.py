@@ -4,8 +4,6 @@ A setting declares its range by its type, such as ``length: Length = 20.0``. pyd
 `experiments.common.schema` check it; everything else sees a float or an int.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 

@@ -13,18 +13,17 @@ import mvest
 from mvest.reporting.figures import ATRIUM, SIDE
 from mvest.valve.anatomy.dimensions import (
     AnnulusDimensions,
-    FreeEdge,
     LeafletDimensions,
     LeafletPair,
 )
 from mvest.valve.measure.clinical import clinical_measurements
 
-posterior = LeafletDimensions(length=22.0, thickness=1.26)
+posterior = LeafletDimensions(length=18.0, thickness=1.26, belly=0.07)
 anatomies = {
     "template": mvest.TemplateParameters(),
-    "wide annulus": mvest.TemplateParameters(annulus=AnnulusDimensions(20.5, 17.0)),
+    "wide annulus": mvest.TemplateParameters(annulus=AnnulusDimensions(41.0, 30.0)),
     "long posterior leaflet": mvest.TemplateParameters(
-        leaflets=LeafletPair(posterior=posterior), free_edge=FreeEdge(posterior_depth=8.5)
+        leaflets=LeafletPair(posterior=posterior)
     ),
 }
 drawn = []

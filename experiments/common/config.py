@@ -4,8 +4,6 @@ Settings of the library are declared in the library (`experiments.common.schema`
 those of a study in its own `Settings`. Everything else is declared here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache

@@ -4,8 +4,6 @@ A setting has one name, type, default and range, all given where it is declared.
 typed or inadmissible override is refused before anything is built.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import types
 import typing

@@ -5,8 +5,6 @@
 run as it is configured.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence

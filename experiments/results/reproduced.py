@@ -1,7 +1,5 @@
 """Whether a run came out as published: ``python -m experiments.results.reproduced [TABLE]``."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -5,8 +5,6 @@ of grids means their union. Settings of the command line hold for every grid and
 choices.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from functools import cache

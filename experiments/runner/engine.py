@@ -5,8 +5,6 @@ of a sweep run on the threads of this process, or on the workers of a dask clust
 both call `execute` for each job.
 """
 
-from __future__ import annotations
-
 import atexit
 import json
 import threading

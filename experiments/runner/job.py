@@ -5,8 +5,6 @@ are lines of JSON on standard input, answers are lines of JSON on standard outpu
 job, crashes of compiled code included, goes to the log in its folder.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import gc
 import json

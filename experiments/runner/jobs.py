@@ -5,8 +5,6 @@ folder holds the digest of its record, and the record belongs to the requested c
 marker is written last. A record and its arrays are replaced only when the new ones are on disk.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

@@ -1,7 +1,5 @@
 """Numbers and settings by which runs are compared, in MLflow and by optimising sweepers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from statistics import fmean, stdev
 from typing import Any

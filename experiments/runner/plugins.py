@@ -4,8 +4,6 @@ Both work with Hydra's other plugins: the launcher with any sweeper (``hydra/swe
 optuna's), and the sweeper with any launcher (``hydra/launcher=basic`` runs jobs in this process).
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from types import ModuleType

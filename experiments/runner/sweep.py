@@ -1,7 +1,5 @@
 """From the jobs of a sweep to its results: skip finished jobs, run the rest, collect, log."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ A run of the store with the same result stays, one with another result is replac
 one is added. The store's database is made once.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os

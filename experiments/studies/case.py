@@ -1,7 +1,5 @@
 """Estimates moduli with intervals for your own valve, from a case folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,10 +46,4 @@ def _read(values: Mapping[str, Any]) -> ValveCase:
     return case
 
 
-STUDY = Study(
-    settings=Settings,
-    run=run,
-    words=case_words,
-    files=write_report,
-    check=check_case,
-)
+STUDY = Study(settings=Settings, run=run, words=case_words, files=write_report, check=check_case)

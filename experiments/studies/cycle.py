@@ -77,10 +77,7 @@ along the path that tests frames for jumps."""
 def run_cycle(job: Job[Settings]) -> Result:
     """Simulate a cycle, compute the bounds of its frames, and make the configured estimates.
 
-    Raises
-    ------
-    InputError
-        If the true cycle fails on one of the meshes, or a setting is inadmissible.
+    InputError if the true cycle fails on one of the meshes, or a setting is inadmissible.
     """
     values, settings = job.values, job.settings.cycle
     truth = np.array(values["truth"]["values"], dtype=float)
@@ -167,7 +164,7 @@ def _estimates(
                 # The error of the estimator's mesh follows from one run on a third mesh.
                 finer = _on_mesh(values, settings, settings.check)
                 try:
-                    wider, _, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
+                    wider, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
                 except InputError as error:
                     numbers["check_mesh"] = str(error)
                     continue

@@ -5,8 +5,6 @@ one configured valve. The experiment `design` varies the number of closed frames
 errors for virtual patients, and makes estimates for some designs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product

@@ -92,13 +92,7 @@ class Settings:
 
 
 def problem_of(about: ExternalSettings, values: Values) -> Problem:
-    """The problem, with a placeholder model.
-
-    Raises
-    ------
-    MvestError
-        If a setting is missing or inadmissible.
-    """
+    """The problem, with a placeholder model. MvestError if a setting is missing or inadmissible."""
     names = tuple(values["parameters"])
     for key, instead in (("P0", "external.prior_std"), ("R", "external.noise_mm")):
         if values["filter"][key] is not None:
@@ -122,10 +116,7 @@ def model_of(
 ) -> ObservationModel:
     """A configured model for ``count`` observed points.
 
-    Raises
-    ------
-    MvestError
-        If the program, a file or a setting is inadmissible.
+    MvestError if the program, a file or a setting is inadmissible.
     """
     source = about.models.get(name, about)
     settings, command = {**about.settings, **source.settings}, source.command
@@ -237,10 +228,7 @@ COLUMNS: dict[str, Column | str] = {
 def check_external(values: Values, folder: Path) -> str:
     """Run the program once at the initial values, and check its derivatives by differences.
 
-    Raises
-    ------
-    MvestError
-        If a setting or a file is inadmissible, or the program gives no prediction.
+    MvestError if a setting or a file is inadmissible, or the program gives no prediction.
     """
     about = build(ExternalSettings, values["external"])
     problem = problem_of(about, values)

@@ -70,10 +70,7 @@ class Settings:
 def run(job: Job[Settings]) -> Result:
     """Run every filter on every problem.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible, or the reference gives no draws.
+    MvestError if a setting is inadmissible, or the reference gives no draws.
     """
     settings, seed = job.settings.filters, job.values["seed"]
     rows: list[dict[str, Any]] = []

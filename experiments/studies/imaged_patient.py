@@ -5,8 +5,6 @@ the true geometry (known geometry), and the true geometry with the error of a vo
 segmentation). Errors that remain in these two are not caused by the images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -51,11 +49,7 @@ from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reporting.skill import skill_table, verdict_table
 from mvest.reporting.tables import Column, Table, table
-from mvest.simulation.imaged_patient import (
-    IMAGED,
-    ImagedPatient,
-    simulate_imaged_patient,
-)
+from mvest.simulation.imaged_patient import IMAGED, ImagedPatient, simulate_imaged_patient
 from mvest.simulation.motion import DrawnValve, MotionSettings
 from mvest.simulation.population import draw_tip_motion
 from mvest.simulation.virtual_patient import PatientSettings, draw_patient_values, first_that_closes

@@ -136,10 +136,8 @@ class Settings:
 def run(job: Job[Settings]) -> Result:
     """Fit the recorded donor valve, or close, gate and estimate the reference heart.
 
-    Raises
-    ------
-    MvestError
-        If the data are missing (the message names their source) or a setting is inadmissible.
+    MvestError if the data are missing (the message names their source) or a setting is
+    inadmissible.
     """
     return _donor(job) if job.settings.donor.case else _heart(job)
 
@@ -179,10 +177,7 @@ DISTANCES = ("mean", "max", "surface")
 def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
     """Read, mesh and load the recorded valve as configured.
 
-    Raises
-    ------
-    MvestError
-        If the data are missing or a setting is inadmissible.
+    MvestError if the data are missing or a setting is inadmissible.
     """
     names = donor.leaflets, donor.annulus, donor.free_edge
     recording = read_recording(recording_folder(donor.recording, donor.case), *names)
@@ -286,10 +281,8 @@ def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]
 def import_heart(heart: HeartSettings) -> ValveCase:
     """Make a case of the valve's open frame.
 
-    Raises
-    ------
-    InputError, GeometryError
-        A part is missing, or does not fit a thick valve with two muscles.
+    InputError or GeometryError if a part is missing, or does not fit a thick valve with two
+    muscles.
     """
     for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
         if file is None or not Path(file).is_file():

@@ -103,10 +103,7 @@ class Settings:
 def run_prediction(job: Job[Settings]) -> Result:
     """Estimate and predict every patient, then compare with the truth.
 
-    Raises
-    ------
-    ConfigurationError
-        If scenarios, samples or the spread of true parameters are inadmissible.
+    ConfigurationError if scenarios, samples or the spread of true parameters are inadmissible.
     """
     config, settings = job.values, job.settings.prediction
     if not settings.scenarios:

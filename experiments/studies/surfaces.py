@@ -5,8 +5,6 @@ imported, and estimated like a user's valve. The exports use no reader or writer
 VTK (through PyVista) cuts and writes surfaces, pandas writes tables, and nibabel writes label maps.
 """
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass
 

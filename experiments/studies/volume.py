@@ -1,7 +1,5 @@
 """Estimates moduli with intervals from your own volume over time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,10 +43,4 @@ def check_volume(values: Mapping[str, Any], folder: Path) -> str:
     return "\n".join([*detected.sentences, f"In order; drawn in {folder / 'montage.png'}"])
 
 
-STUDY = Study(
-    settings=Settings,
-    run=run,
-    words=case_words,
-    files=write_report,
-    check=check_volume,
-)
+STUDY = Study(settings=Settings, run=run, words=case_words, files=write_report, check=check_volume)

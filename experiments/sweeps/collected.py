@@ -1,7 +1,5 @@
 """A collected sweep: ``sweep.json`` of a run, ``results/sweeps/NAME.json`` when published."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -13,8 +13,6 @@ Each check raises one error for the first fault: what is wrong and what would be
 of a case adds file and field.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -65,11 +63,8 @@ def find_loops(
     The free edge is the loop nearer to the papillary tips (mean distance of its vertices from
     their nearest tips). A given loop keeps its order.
 
-    Raises
-    ------
-    GeometryError
-        There are not exactly two boundary loops, or a given list is not one of them; the loop near
-        the tips is the wider one, as if the tips were on the atrial side.
+    GeometryError if there are not exactly two boundary loops, or a given list is not one of them;
+    the loop near the tips is the wider one, as if the tips were on the atrial side.
     """
     loops = two_loops(vertices, triangles)
     outer = None if annulus is None else _which("annulus", annulus, loops)
@@ -262,10 +257,7 @@ def _edges(triangle: tuple[int, ...]) -> list[tuple[int, int]]:
 
 
 def _turn(
-    triangles: list[tuple[int, ...]],
-    owner: dict[tuple[int, int], int],
-    ear: int,
-    loop_of: IntArray,
+    triangles: list[tuple[int, ...]], owner: dict[tuple[int, int], int], ear: int, loop_of: IntArray
 ) -> bool:
     """Flip an inner edge of an ear, if a neighbour has a corner elsewhere."""
     for b, c in _edges(triangles[ear]):

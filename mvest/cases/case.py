@@ -5,8 +5,6 @@ A case is all that an estimation knows of a patient. It is read from a folder
 mm, times s.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@
 errors of all frames are one file of named arrays, NumPy's ``.npz``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,13 +21,7 @@ from mvest.cases.case import (
     check_different,
     check_frames,
 )
-from mvest.cases.frames import (
-    LOOPS,
-    SeenFrame,
-    place_frame,
-    read_frame,
-    reference_band,
-)
+from mvest.cases.frames import LOOPS, SeenFrame, place_frame, read_frame, reference_band
 from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, PointData
 from mvest.cases.tissue import point_data, read_chordae, read_leaflets, write_chordae
 from mvest.errors import InputError
@@ -78,11 +70,8 @@ GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)
 def read_case(path: Path | str) -> ValveCase:
     """Read a case folder (the folder with ``case.yaml``).
 
-    Raises
-    ------
-    InputError, GeometryError
-        Anything missing, unknown, inadmissible or contradictory: one error with file, field,
-        numbers, and what would be right.
+    InputError or GeometryError for anything missing, unknown, inadmissible or contradictory: one
+    error with file, field, numbers, and what would be right.
     """
     folder = CaseFolder(Path(path))
     if not folder.root.is_dir():

@@ -1,7 +1,5 @@
 """One frame of a case: its files read and checked, its annulus matched to the reference frame's."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple

@@ -5,8 +5,6 @@ meaningless moduli: leaflets that shrink to half when the valve closes, exchange
 frames, thickness in centimetres. No valve is closed here; it takes milliseconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace

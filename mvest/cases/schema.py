@@ -5,8 +5,6 @@ values are consistent. The files of a case folder are found by name, never outsi
 hashed.
 """
 
-from __future__ import annotations
-
 import difflib
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence

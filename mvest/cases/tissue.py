@@ -19,13 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mvest.cases.band import (
-    arc_shares,
-    check_thickness,
-    commissures,
-    directed,
-    loop_vector_area,
-)
+from mvest.cases.band import arc_shares, check_thickness, commissures, directed, loop_vector_area
 from mvest.cases.case import Frame, Role
 from mvest.cases.frames import MM_PER, CheckedFrame, SeenFrame
 from mvest.cases.schema import CaseFolder, PointData

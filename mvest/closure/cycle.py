@@ -5,8 +5,6 @@ parameters, so the state is not estimated. New parameters require a new run of t
 that parameters and state are consistent in every frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, zip_longest
@@ -37,26 +35,18 @@ class CycleProtocol:
 
     Pressure, annulus and papillary tips follow one phase: a smooth rise from the open valve's 0 to
     the closed valve's 1, a plateau, and a smooth fall.
-
-    Attributes
-    ----------
-    pressure_mmHg : float
-        Transmitral, on the plateau.
-    rise, hold, fall : float
-        s, durations of the three parts.
-    dt : float
-        s, largest time step; the time between two frames is divided evenly. Leaflets flip within a
-        few milliseconds. If a step is longer, frames jump as parameters change (measured by
-        `experiment=cycle`).
-    times : tuple of float
-        s, times of the observed frames, strictly increasing from >= 0; the run ends at the last.
     """
 
-    pressure_mmHg: Pressure = 120.0
+    pressure_mmHg: Pressure = 120.0  #: transmitral, on the plateau
+    #: s, durations of the three parts
     rise: BeatTime = 0.3
     hold: BeatTime = 0.2
     fall: BeatTime = 0.3
+    #: s, largest time step; the time between two frames is divided evenly. Leaflets flip within a
+    #: few milliseconds. If a step is longer, frames jump as parameters change (measured by
+    #: `experiment=cycle`).
     dt: TimeStep = 0.00625
+    #: s, times of the observed frames, strictly increasing from >= 0; the run ends at the last
     times: tuple[BeatTime, ...] = field(default=DEFAULT_TIMES)
 
     def __post_init__(self) -> None:
@@ -103,10 +93,7 @@ class CycleProtocol:
     def frame_sets(self) -> dict[str, list[int]]:
         """Named sets of observed frames: increasing numbers of frames, and parts of the cycle.
 
-        Raises
-        ------
-        InputError
-            If the valve is not held closed in any frame.
+        InputError if the valve is not held closed in any frame.
         """
         total = len(self.times)
         held = [k for k, time in enumerate(self.times) if self.phase(time) > 1 - 1e-9]
@@ -167,12 +154,7 @@ class CycleModel:
     def frames(self, m: FloatArray) -> FloatArray:
         """Positions ``(f, n, 3)`` mm of the observed vertices with parameters ``m (p,)``.
 
-        Raises
-        ------
-        MaterialError
-            If a modulus is inadmissible.
-        InputError
-            If the cycle does not converge.
+        MaterialError if a modulus is inadmissible. InputError if the cycle does not converge.
         """
         simulation = self.run(m, sensitivities=False)
         if not simulation.converged:
@@ -204,25 +186,19 @@ def compare_time_steps(
 ) -> list[dict[str, Any]]:
     """Measure how the frames of a cycle depend on the time step, along a path of parameters.
 
+    InputError if a step is not half of the one before.
+
+    Returns a list of dicts: one for each time step ``dt`` (s): ``change`` (mm, root mean square
+    over all frames) when the step is halved; its ``order``, the binary logarithm of the ratio of
+    two such changes; ``unevenness``, the largest over the median change along the path, large if
+    frames jump; and the ``reason`` why the path ended early. Unknown numbers are None.
+
     Parameters
     ----------
     model : CycleModel
     dts : sequence of float
         s, each half of the one before.
     path : (n, p)
-
-    Returns
-    -------
-    list of dict
-        One for each time step ``dt`` (s): ``change`` (mm, root mean square over all frames) when
-        the step is halved; its ``order``, the binary logarithm of the ratio of two such changes;
-        ``unevenness``, the largest over the median change along the path, large if frames jump; and
-        the ``reason`` why the path ended early. Unknown numbers are None.
-
-    Raises
-    ------
-    InputError
-        If a step is not half of the one before.
     """
     if any(not np.isclose(b, 0.5 * a) for a, b in pairwise(dts)):
         raise InputError(f"time steps {list(dts)} s, expected each to be half of the one before")
@@ -252,8 +228,11 @@ def _rms(values: FloatArray) -> float:
 
 def with_mesh_error(
     found: Estimate, R: NoiseCovariance, other: CycleModel
-) -> tuple[Estimate, FloatArray, float]:
+) -> tuple[Estimate, float]:
     """Add the mesh error to the covariance of an estimate from a whole cycle.
+
+    Also returns the mean distance (mm) between the frames of the two meshes. InputError if there is
+    no prediction, or no cycle on the other mesh.
 
     Parameters
     ----------
@@ -263,24 +242,10 @@ def with_mesh_error(
         Of the observation.
     other : CycleModel
         The same cycle on a finer mesh; it is run once.
-
-    Returns
-    -------
-    Estimate
-    ndarray, (p,)
-        Shift due to the mesh, in units of the parameters.
-    float
-        mm, mean distance between the frames of the two meshes.
-
-    Raises
-    ------
-    InputError
-        If there is no prediction, or no cycle on the other mesh.
     """
     frames = other.frames(found.mean)
     if found.prediction is None:
         raise InputError("an estimate without a prediction has no derivatives")
     off = frames - found.prediction.y.reshape(frames.shape)
     shift = shift_by_model_error(found, R, off.ravel())
-    moved = shift * found.transform.derivative(found.transformed.mean)
-    return with_shift(found, shift), moved, float(np.linalg.norm(off, axis=-1).mean())
+    return with_shift(found, shift), float(np.linalg.norm(off, axis=-1).mean())

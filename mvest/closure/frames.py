@@ -6,8 +6,6 @@ its own pressure, annulus and papillary tips, reached from the previous frame. A
 scale and offset for all frames (calibration and zero of the sensor) and one error per frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -37,10 +35,7 @@ def is_frame_pressure(name: str) -> bool:
 class FramesModel:
     """A model of the open valve and several closed frames.
 
-    Raises
-    ------
-    InputError
-        If an error refers to no frame, or `SCALE` is missing.
+    InputError if an error refers to no frame, or `SCALE` is missing.
     """
 
     model: ClosureModel  #: closes the valve to the closed frame, under the pressure of its protocol

@@ -161,10 +161,7 @@ class ClosureModel:
 
         The system is built once and belongs to the model.
 
-        Raises
-        ------
-        MaterialError
-            If a modulus is inadmissible.
+        MaterialError if a modulus is inadmissible.
         """
         values = self._values(m)
         if self._system is None:
@@ -258,6 +255,8 @@ class ClosureModel:
     ) -> ClosureResult:
         """Run the closure with parameters ``m (p,)``.
 
+        MaterialError if a modulus is inadmissible.
+
         Parameters
         ----------
         m : ndarray
@@ -266,11 +265,6 @@ class ClosureModel:
         every_frame : bool
             Whether all frames are needed, not only the last. They are then solved to the full
             tolerance, and the closure starts from the open valve.
-
-        Raises
-        ------
-        MaterialError
-            If a modulus is inadmissible.
         """
         if every_frame:
             return self._close(m, sensitivities, every_frame=True)
@@ -384,6 +378,9 @@ class ClosureModel:
     ) -> list[Simulation]:
         """Compute the closure, then one equilibrium after another until one fails.
 
+        InputError if a state's annulus or tips are not those of the valve. MaterialError if a
+        modulus is inadmissible.
+
         Parameters
         ----------
         m : (p,)
@@ -394,13 +391,6 @@ class ClosureModel:
         start : (n, 3) mm, optional
             Nodal positions, for example of a closed valve of other tissue, that are brought to rest
             under the final loads to find the closed state.
-
-        Raises
-        ------
-        InputError
-            If a state's annulus or tips are not those of the valve.
-        MaterialError
-            If a modulus is inadmissible.
         """
         system, parameters = self.tuned(m)
         if not sensitivities:

@@ -14,8 +14,6 @@ below the line between the hinges of both leaflets.
 `resistance_rows` says by which tissue a leaflet resists (`mvest.mechanics.resistance`).
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections import defaultdict
 from collections.abc import Mapping

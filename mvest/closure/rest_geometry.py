@@ -5,8 +5,6 @@ on the surface and its fraction of the thickness. Embeddings do not change, so t
 points are observed, touch and are held.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -38,18 +36,15 @@ PARTS = ("shape", "thickness", "fibres", "annulus", "tips", "rest_lengths", "ins
 class RestGeometry:
     """The rest geometry of a closing valve, and the closed state's dependence on it.
 
+    InputError if the protocol does not end in equilibrium: a moving valve has a history, which also
+    depends on the geometry.
+
     Parameters
     ----------
     model : ClosureModel
         Its protocol must end in an equilibrium.
     seen : ClosureModel, optional
         The undisplaced model, if changes are measured from it.
-
-    Raises
-    ------
-    InputError
-        If the protocol does not end in equilibrium: a moving valve has a history, which also
-        depends on the geometry.
     """
 
     def __init__(self, model: ClosureModel, seen: ClosureModel | None = None) -> None:
@@ -108,15 +103,18 @@ class RestGeometry:
         The annulus and the papillary tips of the closed valve do not move; the chordae follow the
         leaflets.
         """
-        contact, by_vertex = self.model.contact_valve.surface, np.moveaxis(moves, 0, -1)
-        members, weights, slope = self._patches
+        by_vertex = np.moveaxis(moves, 0, -1)
         turn = self._at(self._closest, leaflet_normals_change(self.surface, by_vertex))
         turn /= np.linalg.norm(self._at(self._closest, self._normals), axis=1)[:, None, None]
         turn -= self._normal[:, :, None] * np.einsum("ni,niq->nq", self._normal, turn)[:, None]
-        nodes = self._at(self._feet, by_vertex) + self._height[:, None, None] * turn
+        return self._followed(self._at(self._feet, by_vertex) + self._height[:, None, None] * turn)
+
+    def _followed(self, nodes: FloatArray) -> RestVariation:
+        """Displacements ``(n, 3, q)`` mm of the mesh, with what follows its middle surface."""
+        contact, (members, weights, slope) = self.model.contact_valve.surface, self._patches
         samples = self._sampled(nodes)
         areas = lumped_areas_change(contact.vertices, contact.triangles, samples).T
-        ends = self._ends(by_vertex)[:, None] - samples[members]
+        ends = self._ends(self.model.observed(nodes))[:, None] - samples[members]
         wider = (areas / contact.areas)[:, members]
         return RestVariation(
             np.ascontiguousarray(np.moveaxis(nodes, -1, 0)),
@@ -130,14 +128,15 @@ class RestGeometry:
         return np.linalg.svd(unit_rows(self._ends(self._normals))[:, None])[2][:, 1:]
 
     def thickness(self, factors: FloatArray) -> RestVariation:
-        """Relative changes ``(q, n)`` of the thickness at the surface's vertices."""
-        nodes = [
-            (self._height * self._at(self._closest, factor))[:, None] * self._normal
-            for factor in factors
-        ]
+        """Relative changes ``(q, n)`` of the thickness at the surface's vertices.
+
+        Where faces of the mesh are not equally far from the surface, its middle moves, too.
+        """
+        faces = self._height[:, None] * self._at(self._closest, factors.T)
         own = self.seen.contact_valve.surface.thickness
-        thickness = [own * self._at(self._samples, factor) for factor in factors]
-        return RestVariation(np.array(nodes), thickness=np.array(thickness))
+        thickness = own * self._at(self._samples, factors.T).T
+        nodes = self._normal[:, :, None] * faces[:, None]
+        return replace(self._followed(nodes), thickness=thickness)
 
     def fibres(self, angles: FloatArray) -> RestVariation:
         """Rotation of each region's fibres about its normals by ``(q, regions)`` rad."""
@@ -182,15 +181,9 @@ class RestGeometry:
         its derivative predicts. Junctions of the chordae stay: their place at rest only matters
         while they are slack.
 
-        Parameters
-        ----------
-        parts : mapping
-            Some of `PARTS` -> one quantity each, where `variation` takes several.
+        GeometryError if a leaflet would have no thickness, or a chord no length.
 
-        Raises
-        ------
-        GeometryError
-            If a leaflet would have no thickness, or a chord no length.
+        ``parts``: some of `PARTS` -> one quantity each, where `variation` takes several.
         """
         own = {name: np.asarray(values)[None] for name, values in parts.items()}
         model, nodes = self.model, np.zeros_like(self.model.mesh.nodes)

@@ -6,8 +6,6 @@ compares the closed surfaces. It also follows the closed surface along changing 
 (:mod:`mvest.closure.smoothness`): the path may curve but must not jump.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -78,18 +76,10 @@ GATE_CASES = (
 
 @dataclass(frozen=True, slots=True)
 class GateRow:
-    """Outcome of one case.
-
-    Attributes
-    ----------
-    case : str
-    mean_mm, max_mm : float
-        Distance between this closed surface and the reference's; NaN if the closure failed.
-    passed : bool
-    reason : str
-    """
+    """Outcome of one case."""
 
     case: str
+    #: distance between this closed surface and the reference's; NaN if the closure failed
     mean_mm: float
     max_mm: float
     passed: bool
@@ -116,10 +106,8 @@ class GateReport:
 def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
     """A fresh model that closes from the open valve, with a case's changes except the mesh.
 
-    Raises
-    ------
-    InputError
-        If the case needs another mesh or other contact samples; these must come from an anatomy.
+    InputError if the case needs another mesh or other contact samples; these must come from an
+    anatomy.
     """
     if case.remeshed:
         raise InputError(f"gate case {case.name!r} needs another mesh or other contact samples")

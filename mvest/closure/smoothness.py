@@ -61,24 +61,14 @@ class PathState:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """The part of a path between two neighbouring states.
+    """The part of a path between two neighbouring states."""
 
-    Attributes
-    ----------
-    low, high : float
-        Factors on the moduli.
-    unexplained_mm : float
-        Largest unexplained motion of a vertex.
-    vertices : int
-        Number of vertices that exceed `JUMP_LIMIT`.
-    unexplained, way : float
-        mm, unexplained motion and whole motion by the derivatives; norms over all vertices.
-    """
-
+    #: factors on the moduli
     low: float
     high: float
-    unexplained_mm: float
-    vertices: int
+    unexplained_mm: float  #: largest unexplained motion of a vertex
+    vertices: int  #: number of vertices that exceed `JUMP_LIMIT`
+    #: mm, unexplained motion and whole motion by the derivatives; norms over all vertices
     unexplained: float
     way: float
 

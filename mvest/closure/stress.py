@@ -7,8 +7,6 @@ those of :math:`U S U / \det U`. Computed from the Green-Lagrange strain rather 
 include the enhanced strain of solid-shells, which is not part of F.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mvest.errors import InputError
@@ -56,17 +54,14 @@ def peak_stress(system: System, x: FloatArray) -> dict[str, float]:
     a chordal insertion or at the hinge, and grows with mesh refinement; the percentiles grow much
     less.
 
+    InputError if an element is inverted.
+
     Parameters
     ----------
     system : System
         Set to its parameters.
     x : ndarray
         ``(n, 3)`` mm nodal positions.
-
-    Raises
-    ------
-    InputError
-        If an element is inverted.
     """
     values, mesh = _stress(system, x), system.solid.mesh
     if not np.isfinite(values).all():

@@ -43,23 +43,14 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class ApproximationCheck:
-    """One property of a filter's posterior, with its limit.
+    """One property of a filter's posterior, with its limit."""
 
-    Attributes
-    ----------
-    compared : str
-        What was compared.
-    value, limit : float
-        The difference, infinite if it could not be computed; the estimate's interval is valid up to
-        the limit.
-    runs : int
-        Runs of the model that were compared.
-    """
-
-    compared: str
+    compared: str  #: what was compared
+    #: the difference, infinite if it could not be computed; the estimate's interval is valid up to
+    #: the limit
     value: float
     limit: float
-    runs: int
+    runs: int  #: runs of the model that were compared
 
     def __post_init__(self) -> None:
         if np.isnan(self.value) or not self.limit > 0.0:

@@ -46,26 +46,17 @@ class InnovationSummary:
     The innovation e = y − h(z) + H (z − m) is linearised at the estimate z. For a linear model it
     is y less the prediction at the prior's mean m. The paper's filter uses the same y in each
     round, so that its `nis` is smaller than a chi-square number.
-
-    Attributes
-    ----------
-    size : int
-        Number n of observations.
-    rms, max_abs : float, in units of the observation
-        Root mean square and largest absolute value of e.
-    nis : float
-        eᵀ S⁻¹ e, chi-square with n degrees of freedom if the model and its covariances are right.
-    nis_band : (float, float)
-        Band that holds such a number with 95 % probability.
-    residual_rms : float, in units of the observation
-        Root mean square of the residual y − h(z) of the estimate.
     """
 
-    size: int
+    size: int  #: number n of observations
+    #: in units of the observation, root mean square and largest absolute value of e
     rms: float
     max_abs: float
+    #: eᵀ S⁻¹ e, chi-square with n degrees of freedom if the model and its covariances are right
     nis: float
+    #: band that holds such a number with 95 % probability
     nis_band: tuple[float, float]
+    #: in units of the observation, root mean square of the residual y − h(z) of the estimate
     residual_rms: float | None = None
 
 

@@ -16,8 +16,6 @@ The covariance of log θ follows from the second derivatives (Laplace), E is the
     P⁺ = E P⁺(θ) + (dz/dθ) cov(θ) (dz/dθ)ᵀ
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple

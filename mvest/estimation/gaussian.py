@@ -19,11 +19,8 @@ DEFINITENESS_TOLERANCE = 1e-12
 class Gaussian:
     """Normal distribution N(m, P) of p parameters.
 
-    Raises
-    ------
-    InputError
-        If shapes disagree, a value is not finite, or the covariance is not symmetric positive
-        semi-definite; the message gives the offending values.
+    InputError if shapes disagree, a value is not finite, or the covariance is not symmetric
+    positive semi-definite; the message gives the offending values.
     """
 
     mean: FloatArray  #: (p,) in units of each parameter

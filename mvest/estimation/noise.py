@@ -46,10 +46,7 @@ class ObservationNoise:
 def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
     """Check the noise covariance of ``size`` observations and factorise it once.
 
-    Raises
-    ------
-    InputError
-        If R has the wrong size, or is not symmetric positive definite.
+    InputError if R has the wrong size, or is not symmetric positive definite.
     """
     if isinstance(R, ObservationNoise | NoiseFamily):
         if R.size != size:
@@ -112,10 +109,7 @@ def stacked_noise(parts: Sequence[ObservationNoise]) -> ObservationNoise:
 def scaled_noise(base: ObservationNoise, scale: FloatArray) -> ObservationNoise:
     """Noise D R D with R of ``base`` and the positive diagonal ``scale (n,)`` of D.
 
-    Raises
-    ------
-    InputError
-        If the factors are not of n observations, or not positive.
+    InputError if the factors are not of n observations, or not positive.
     """
     factor = np.asarray(scale, dtype=np.float64)
     if factor.shape != (base.size,):
@@ -139,10 +133,7 @@ def low_rank_noise(base: ObservationNoise, columns: FloatArray) -> ObservationNo
 
     so that (I − U diag(1 − 1 / √(1 + s²)) Uᵀ) W whitens the sum.
 
-    Raises
-    ------
-    InputError
-        If C is not of n observations, or not finite.
+    InputError if C is not of n observations, or not finite.
     """
     C = np.asarray(columns, dtype=np.float64)
     if C.ndim != 2 or len(C) != base.size:
@@ -227,10 +218,7 @@ class NoiseFamily:
 
     Code that expects a fixed noise gets the noise at the medians.
 
-    Raises
-    ------
-    InputError
-        If the blocks' quantities are not those given, or names repeat.
+    InputError if the blocks' quantities are not those given, or names repeat.
     """
 
     blocks: tuple[NoiseBlock, ...]  #: one after another in the observation
@@ -289,6 +277,8 @@ class NoiseFamily:
     def at(self, log: FloatArray, beats: float = 1.0) -> ObservationNoise:
         """The noise for given quantities.
 
+        InputError if there is less than one beat, or no noise is left.
+
         Parameters
         ----------
         log : (h,)
@@ -297,11 +287,6 @@ class NoiseFamily:
             Heart beats whose mean is observed, may be infinite. It divides the variances of the
             smooth and the rough part, which are independent from beat to beat. Resolution and added
             columns are the same in every beat.
-
-        Raises
-        ------
-        InputError
-            If there is less than one beat, or no noise is left.
         """
         if not beats >= 1.0:
             raise InputError(f"mean of {beats} beats, expected >= 1")

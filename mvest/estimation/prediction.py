@@ -14,11 +14,8 @@ from mvest.typing import FloatArray, IntArray
 class Prediction:
     """Predicted observation h(m) and its Jacobian H = dh/dm, or the reason why there is none.
 
-    Raises
-    ------
-    InputError
-        If a converged prediction has wrong shapes or values that are not finite, or a failed one
-        has values or no reason.
+    InputError if a converged prediction has wrong shapes or values that are not finite, or a failed
+    one has values or no reason.
     """
 
     #: (n,) in units of the observation, predicted observation; empty if the model failed
@@ -105,10 +102,8 @@ def as_prediction(
 ) -> Prediction:
     """Check what a model of p parameters returned, n observations if n is given.
 
-    Raises
-    ------
-    InputError
-        If it is no prediction, its shapes are not (n,) and (n, p), or ``derivatives`` are missing.
+    InputError if it is no prediction, its shapes are not (n,) and (n, p), or ``derivatives`` are
+    missing.
     """
     if isinstance(returned, Prediction):
         prediction = returned

@@ -261,6 +261,9 @@ class Filter:
     ) -> Estimate:
         """Estimate the parameters of a model.
 
+        InputError if a setting, a shape or a covariance is not admissible; never for a failing
+        model.
+
         Parameters
         ----------
         model : ObservationModel
@@ -274,11 +277,6 @@ class Filter:
             Filter coordinates; default `Identity`.
         on_iterate : callable, optional
             Called with each iterate.
-
-        Raises
-        ------
-        InputError
-            If a setting, a shape or a covariance is not admissible; never for a failing model.
         """
         return self.estimate(FilterRun(model, prior, y, R, names, transform, on_iterate))
 

@@ -20,8 +20,6 @@ The variance of K samples is uncertain itself: c = (t / 1.96)² with t the 97.5 
 distribution with K degrees of freedom, so that ± 1.96 standard deviations are a 95 % interval.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,18 +40,13 @@ SEEN = 1e-5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledPosterior:
-    """Covariance of an estimate, and the samples' part of it.
+    """Covariance of an estimate, and the samples' part of it."""
 
-    Attributes
-    ----------
-    covariance, from_samples : (p, p)
-    moved : (p, K)
-        Shift of the estimate by each sample, with a gain computed without it; scaled so that
-        ``moved @ moved.T`` is ``from_samples``.
-    """
-
+    #: (p, p)
     covariance: FloatArray
     from_samples: FloatArray
+    #: (p, K), shift of the estimate by each sample, with a gain computed without it; scaled so that
+    #: ``moved @ moved.T`` is ``from_samples``
     moved: FloatArray
 
 
@@ -98,10 +91,7 @@ class SampledErrors:
         return low_rank_noise(self.base, self.columns)
 
     def posterior(
-        self,
-        jacobian: FloatArray,
-        prior: FloatArray,
-        curvature: FloatArray | None = None,
+        self, jacobian: FloatArray, prior: FloatArray, curvature: FloatArray | None = None
     ) -> SampledPosterior:
         """Covariance of an estimate with H ``(n, p)`` and the prior's covariance P ``(p, p)``.
 

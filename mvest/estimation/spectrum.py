@@ -13,8 +13,6 @@ Machine Learning, 2006, section 8.1). The rest is spread evenly over all directi
 costs k m² once, and k m for whitening a vector.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,25 +80,15 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Basis:
-    """K of k points as U diag(w) Uᵀ + r (I − U Uᵀ), with the exact total variance.
+    """K of k points as U diag(w) Uᵀ + r (I − U Uᵀ), with the exact total variance."""
 
-    Attributes
-    ----------
-    points : (k, d)
-    U, w, band : (k, m), (m,), (m,)
-        Orthonormal columns, with the eigenvalue and the band of each.
-    across : float
-        r.
-    length : float
-        Of K.
-    """
-
-    points: FloatArray
+    points: FloatArray  #: (k, d)
+    #: (k, m), (m,), (m,), orthonormal columns, with the eigenvalue and the band of each
     U: FloatArray
     w: FloatArray
     band: IntArray
-    across: float
-    length: float
+    across: float  #: r
+    length: float  #: of K
 
 
 def smooth_basis(points: FloatArray, length: float) -> Basis:
@@ -147,22 +135,15 @@ def spread_points(points: FloatArray, count: int) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """Prior of a smooth part with a stated standard deviation and length.
+    """Prior of a smooth part with a stated standard deviation and length."""
 
-    Attributes
-    ----------
-    std, length : LogNormal
-        Of a Matérn correlation.
-    deviation : float
-        Factor by which a band may deviate from it, one standard deviation; neighbouring bands are
-        correlated.
-    reference : float
-        Length of K over the stated one; eigenvectors of a short one mix coarse detail.
-    """
-
+    #: of a Matérn correlation
     std: LogNormal
     length: LogNormal
+    #: factor by which a band may deviate from it, one standard deviation; neighbouring bands are
+    #: correlated
     deviation: float = 1.65
+    #: length of K over the stated one; eigenvectors of a short one mix coarse detail
     reference: float = 3.0
 
     @property

@@ -57,6 +57,8 @@ def kalman_update(
     whatever the rounding, and Hᵀ R⁻¹ H, whose condition number is the square of that of W H, is
     never formed. P may be singular.
 
+    InputError if shapes disagree.
+
     Parameters
     ----------
     prior : Gaussian
@@ -64,11 +66,6 @@ def kalman_update(
     innovation : (n,) in units of the observation
     H : (n, p) in units of the observation per unit of parameter
     noise : ObservationNoise
-
-    Raises
-    ------
-    InputError
-        If shapes disagree.
     """
     n, p = noise.size, prior.size
     if innovation.shape != (n,) or H.shape != (n, p):

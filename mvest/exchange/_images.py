@@ -5,8 +5,6 @@ spacing of 1, an origin of 0); here a missing field is an error. The number of v
 the header, because SimpleITK accepts some truncated files.
 """
 
-from __future__ import annotations
-
 import gzip
 import struct
 import zlib

@@ -6,8 +6,6 @@ Format: https://teem.sourceforge.net/nrrd/format.html. 3D Slicer puts the frame 
 Slicer. ITK writes a volume over time with ``space dimension: 4`` and no space; such files are LPS.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Mapping

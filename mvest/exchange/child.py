@@ -7,8 +7,6 @@ with the first file, and again after a crash.
 Starting takes 0.3 s, a call 1 ms, and passing 100 MB of arrays 0.1 s.
 """
 
-from __future__ import annotations
-
 import atexit
 import importlib
 import json
@@ -51,11 +49,8 @@ def in_child(
     The function is defined at module level. It returns a tree of dict (with str keys), list, str,
     int, float, bool, None and numeric NumPy arrays; tuples become lists. Arguments must fit JSON.
 
-    Raises
-    ------
-    MvestError
-        As raised by the function. An `InputError`, one line that names the file, if the file is
-        missing, the function raised anything else, or the child exceeded a limit or crashed.
+    MvestError as raised by the function. An `InputError`, one line that names the file, if the file
+    is missing, the function raised anything else, or the child exceeded a limit or crashed.
     """
     global _child, _owner
     if not path.is_file():
@@ -132,13 +127,7 @@ def _write(stream: Any, tree: Any) -> None:
 
 
 def _read(stream: Any) -> Any:
-    """Read a tree written by `_write`.
-
-    Raises
-    ------
-    EOFError
-        The stream ended.
-    """
+    """Read a tree written by `_write`. EOFError if the stream ended."""
 
     def exactly(size: int) -> np.ndarray:
         content = np.empty(size, dtype=np.uint8)

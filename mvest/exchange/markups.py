@@ -52,10 +52,8 @@ class PointList:
 def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
     """Write lists of points and curves, by name, to a ``.mrk.json`` file.
 
-    Raises
-    ------
-    InputError
-        The suffix differs, there are no lists, a position is not finite, or writing fails.
+    InputError if the suffix differs, there are no lists, a position is not finite, or writing
+    fails.
     """
     target = Path(path)
     if not target.name.endswith(".mrk.json") or not lists:
@@ -81,11 +79,8 @@ def read_markups(path: Path | str) -> dict[str, PointList]:
     A list without a name is named after the file, as in Slicer. Points without a position go to
     `PointList.unplaced`.
 
-    Raises
-    ------
-    InputError
-        The file is missing, has neither format, or has an unknown coordinate system or length unit,
-        or a placed point without three numbers.
+    InputError if the file is missing, has neither format, or has an unknown coordinate system or
+    length unit, or a placed point without three numbers.
     """
     source = Path(path)
     if source.suffix.lower() == ".fcsv":

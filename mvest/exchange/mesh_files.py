@@ -4,8 +4,6 @@ VTK reads its own formats and OBJ; trimesh reads PLY and GLB. STL is read here, 
 truncated STL files.
 """
 
-from __future__ import annotations
-
 import importlib
 import io
 import json
@@ -32,10 +30,8 @@ STL_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attrib
 def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     """The fields of `mvest.exchange.surfaces.Surface` from a file of this kind.
 
-    Raises
-    ------
-    InputError, GeometryError
-        The file is damaged or has no points or cells, or cells name points that do not exist.
+    InputError or GeometryError if the file is damaged or has no points or cells, or cells name
+    points that do not exist.
     """
     data, groups = READERS[suffix](path)
     if not data.GetNumberOfPoints():

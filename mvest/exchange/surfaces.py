@@ -6,8 +6,6 @@ merged in surfaces from several files, and in STL, OBJ and GLB files. Merged ver
 in triangle order, so that two files with the same triangles in the same order correspond.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,49 +39,30 @@ NAME_THEM = "name them anterior and posterior (also in place of AML, PML or Ante
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A triangulated surface with the data of its file.
+    """A triangulated surface with the data of its file."""
 
-    Attributes
-    ----------
-    vertices
-        ``(n, 3)`` in the unit of the file; finite.
-    triangles
-        ``(m, 3)``; polygons are split.
-    point_data, cell_data
-        Named arrays with n or m rows.
-    groups
-        Object name of each triangle (GLB); empty if there are none.
-    region
-        ``(m,)`` index into the case's regions; None without labels.
-    others
-        Number of cells of each other type, by VTK name ("tetra", "wedge"); single vertices are
-        not counted.
-    lines
-        ``(k, 2)`` ends of the line segments of the file.
-    space
-        "LPS" or "RAS" if 3D Slicer named the axes in a title, comment or field data; else None.
-    """
-
-    vertices: FloatArray
-    triangles: IntArray
+    vertices: FloatArray  #: ``(n, 3)`` in the unit of the file; finite
+    triangles: IntArray  #: ``(m, 3)``; polygons are split
+    #: named arrays with n or m rows
     point_data: Data = field(default_factory=dict)
     cell_data: Data = field(default_factory=dict)
-    groups: Sequence[str] = ()
-    region: IntArray | None = None
+    groups: Sequence[str] = ()  #: object name of each triangle (GLB); empty if there are none
+    region: IntArray | None = None  #: ``(m,)`` index into the case's regions; None without labels
+    #: number of cells of each other type, by VTK name ("tetra", "wedge"); single vertices are not
+    #: counted
     others: Mapping[str, int] = field(default_factory=dict)
+    #: "LPS" or "RAS" if 3D Slicer named the axes in a title, comment or field data; else None
     space: str | None = None
+    #: ``(k, 2)`` ends of the line segments of the file
     lines: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
 
 def read_mesh(path: Path | str) -> Surface:
     """Read the points, triangles and lines of a file.
 
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, or its suffix is not one of `SURFACE_SUFFIXES`.
-    GeometryError
-        Points are not finite or beyond `MAX_NUMBER`, or cells name points that do not exist.
+    InputError if the file is missing or damaged, or its suffix is not one of `SURFACE_SUFFIXES`.
+    GeometryError if points are not finite or beyond `MAX_NUMBER`, or cells name points that do not
+    exist.
     """
     source = Path(path)
     _check_suffix(source, SURFACE_SUFFIXES)
@@ -101,10 +80,8 @@ def read_surface(path: Path | str) -> Surface:
 
     `mvest.valve.geometry.surface_checks` checks whether it is closed or manifold.
 
-    Raises
-    ------
-    InputError, GeometryError
-        As `read_mesh`; or there are no triangles, or there are cells of other types.
+    InputError or GeometryError as `read_mesh`; or there are no triangles, or there are cells of
+    other types.
     """
     found = read_mesh(path)
     if found.others:
@@ -125,6 +102,9 @@ def read_regions(
     ``region``, the point data ``region`` (a triangle takes the label that two corners share), the
     object names (GLB). A single region needs no labels.
 
+    InputError or GeometryError if a file is missing or damaged, labels are missing or unknown, or a
+    region has no triangles.
+
     Parameters
     ----------
     files
@@ -132,11 +112,6 @@ def read_regions(
     regions
         Region of every number in the data, or of every object name; several may share a region.
         The regions are numbered in the order of their first label.
-
-    Raises
-    ------
-    InputError, GeometryError
-        A file is missing or damaged, labels are missing or unknown, or a region has no triangles.
     """
     if isinstance(files, Path):
         with refusing(files, "surface"):
@@ -273,10 +248,8 @@ def write_surface(
 
     ``space`` ("LPS") names the axes for 3D Slicer.
 
-    Raises
-    ------
-    InputError, GeometryError
-        The suffix differs, a point is not finite, or the file cannot be written.
+    InputError or GeometryError if the suffix differs, a point is not finite, or the file cannot be
+    written.
     """
     target = Path(path)
     _check_suffix(target, (".vtp",))

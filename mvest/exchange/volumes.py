@@ -9,8 +9,6 @@ centimetres taken for millimetres, a mask, a localiser. A label map may be small
 an image.
 """
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import io
@@ -108,6 +106,9 @@ def read_volume(
 ) -> VolumeSequence:
     """Read a volume over time, or a single frame. Left-handed directions stay left-handed.
 
+    InputError if the file is damaged, has an unsupported format, lacks required information,
+    contradicts an argument, or is not a plausible image of a heart.
+
     Parameters
     ----------
     path
@@ -119,12 +120,6 @@ def read_volume(
         Seconds between frames, for files that give no times in a unit of time.
     time_unit
         ``"s"`` or ``"ms"``, for files that give times without a unit.
-
-    Raises
-    ------
-    InputError
-        The file is damaged, has an unsupported format, lacks required information, contradicts an
-        argument, or is not a plausible image of a heart.
     """
     source = Path(path)
     if source.is_dir():
@@ -140,10 +135,7 @@ def read_volume(
 def read_labels(path: Path | str) -> LabelMap:
     """Read a label map or segmentation: NRRD, MetaImage or NIfTI of three or four axes.
 
-    Raises
-    ------
-    InputError
-        As `read_volume`; or the file is an image, has no labels, or has non-integer values.
+    InputError as `read_volume`; or the file is an image, has no labels, or has non-integer values.
     """
     found = _read(Path(path), True)
     del found["sha256"]
@@ -164,10 +156,7 @@ def write_sequence_nrrd(path: Path | str, sequence: VolumeSequence) -> Path:
     Equal content gives equal bytes. The frame axis comes first; all versions of Slicer can read
     that order.
 
-    Raises
-    ------
-    InputError
-        The name or voxel type is not supported, or the file cannot be written.
+    InputError if the name or voxel type is not supported, or the file cannot be written.
     """
     target = sequence_path(path)
     if (found := sequence.frames.dtype.name) not in WRITABLE:

@@ -5,8 +5,6 @@ first leaflet in between; ``s`` runs from the annulus (0) to the free edge (1). 
 + i`` is column i, row j: the first row is the annulus, the last one the free edge.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar

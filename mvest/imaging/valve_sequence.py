@@ -6,8 +6,6 @@ to the line between the leaflets at phi = 0. The image step returns one valve in
 its confidence.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """A volume over time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

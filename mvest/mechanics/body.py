@@ -3,8 +3,6 @@
 Rectangular blocks of any element serve as sheets, strips and patches for examples and verification.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -53,6 +51,10 @@ def simulate_body(
     solver: str = "auto",
 ) -> Simulation:
     """Simulate a body with fixed nodes, pressure on faces and forces on nodes.
+
+    InputError, GeometryError or MaterialError if an array has a wrong shape, an index out of
+    range or a value that is not finite; times do not increase; an element is inverted; a pressure
+    face belongs to no element or points into the solid; the material is invalid or needs a fibre.
 
     Parameters
     ----------
@@ -105,13 +107,6 @@ def simulate_body(
     Simulation
         Frames ``(1 + completed steps, n, 3)`` mm, the initial state first, and the reason why the
         run ended. A run that does not converge is a result, not an exception.
-
-    Raises
-    ------
-    InputError, GeometryError, MaterialError
-        An array has a wrong shape, an index out of range or a value that is not finite; times do
-        not increase; an element is inverted; a pressure face belongs to no element or points into
-        the solid; the material is invalid or needs a fibre.
 
     Examples
     --------
@@ -228,9 +223,7 @@ def _force_curve(
     return lambda t: constant
 
 
-def _pressure_curve(
-    pressure: Callable[[float], float] | ArrayLike,
-) -> Callable[[float], float]:
+def _pressure_curve(pressure: Callable[[float], float] | ArrayLike) -> Callable[[float], float]:
     if callable(pressure):
         return pressure
     table = np.asarray(pressure, dtype=float)

@@ -4,8 +4,6 @@
 points. An enhanced strain is ``direction (e, q, 6)`` times ``polynomials (q, m)`` times alpha.
 """
 
-from __future__ import annotations
-
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray

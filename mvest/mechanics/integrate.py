@@ -19,8 +19,6 @@ Numer. Meth. Engng 37:2471): with the factorised A of the converged step, for ea
           - \partial_{\epsilon_n} f_{int} \, d\epsilon_n .
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -35,14 +33,7 @@ from mvest.mechanics.law import Points
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import SolidState
 from mvest.mechanics.solver import EXACT, LinearSolver, linear_solver
-from mvest.mechanics.steps import (
-    Damping,
-    NewtonSettings,
-    Simulation,
-    Step,
-    StepReason,
-    StepRecord,
-)
+from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step, StepReason, StepRecord
 from mvest.mechanics.system import Evaluation, Loads, System
 from mvest.typing import FloatArray
 
@@ -116,6 +107,9 @@ def simulate(
 ) -> Simulation:
     """Integrate ``system`` over ``steps``.
 
+    Returns the completed frames, and the reason for the end. InputError if the steps are not
+    increasing.
+
     Parameters
     ----------
     system : System
@@ -141,16 +135,6 @@ def simulate(
         s.
     on_step : callable, optional
         Called with (time, Newton iterations so far) after each step, for progress.
-
-    Returns
-    -------
-    Simulation
-        Holds the completed frames, and the reason for the end.
-
-    Raises
-    ------
-    InputError
-        If the steps are not increasing.
     """
     damping = damping or Damping()
     newton = newton or NewtonSettings()

@@ -11,8 +11,6 @@ combination of the :math:`v_k`, and :math:`M^{-1} r` the same combination of the
 small enough, it is added to the solution as a last correction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

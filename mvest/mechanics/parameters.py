@@ -5,8 +5,6 @@ papillary tip, or the leaflet and number of a mode. Each law lists the kinds tha
 (:attr:`mvest.mechanics.law.Law.kinds`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from enum import Enum
@@ -25,26 +23,15 @@ class NamePart(Enum):
 
 
 class Kind(NamedTuple):
-    """One kind of parameter.
+    """One kind of parameter."""
 
-    Attributes
-    ----------
-    unit : str
-        Empty if dimensionless.
-    part : NamePart
-    low, high : float
-        Range that a configuration may use.
-    description : str
-    positive : bool
-        Whether it is positive, so that its logarithm is estimated.
-    """
-
-    unit: str
+    unit: str  #: empty if dimensionless
     part: NamePart
+    #: range that a configuration may use
     low: float
     high: float
     description: str
-    positive: bool = True
+    positive: bool = True  #: whether it is positive, so that its logarithm is estimated
 
     @property
     def whole(self) -> bool:

@@ -36,35 +36,24 @@ round-off are both about 1e-8 of a derivative."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RestVariation:
-    """Changes of a body at rest and of its supports, per unit of each of q quantities.
+    """Changes of a body at rest and of its supports, per unit of each of q quantities."""
 
-    Attributes
-    ----------
-    nodes : (q, n, 3) mm
-        Displacement of the nodes at rest.
-    fibre : (q, e, k, 3) or None
-        Change of the fibre directions at the elements' nodes, across the fibres.
-    areas, thickness : (q, c) mm² and mm, or None
-        Changes at the contact points.
-    supports : (q, h, 3) mm or None
-        Displacement of the supports' targets.
-    tips : (q, t, 3) mm or None
-    rest_length : (q, segments) or None
-        Relative change of the rest lengths of the cables' segments.
-    patches : (q, cables, s) or None
-        Change of the weights of the contact points whose average is a cable's end.
-    members : (cables, s) or None
-        These contact points, the same for all quantities.
-    """
-
-    nodes: FloatArray
+    nodes: FloatArray  #: (q, n, 3) mm, displacement of the nodes at rest
+    #: (q, e, k, 3) or None, change of the fibre directions at the elements' nodes, across the
+    #: fibres
     fibre: FloatArray | None = None
+    #: (q, c) mm² and mm, or None, changes at the contact points
     areas: FloatArray | None = None
     thickness: FloatArray | None = None
+    #: (q, h, 3) mm or None, displacement of the supports' targets
     supports: FloatArray | None = None
-    tips: FloatArray | None = None
+    tips: FloatArray | None = None  #: (q, t, 3) mm or None
+    #: (q, segments) or None, relative change of the rest lengths of the cables' segments
     rest_length: FloatArray | None = None
+    #: (q, cables, s) or None, change of the weights of the contact points whose average is a
+    #: cable's end
     patches: FloatArray | None = None
+    #: (cables, s) or None, these contact points, the same for all quantities
     members: IntArray | None = None
 
     def __len__(self) -> int:

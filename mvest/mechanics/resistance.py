@@ -8,8 +8,6 @@ such as a derivative of the closed valve, adds up from its parts as well; so doe
 stress on the strain, because mean and deviation are orthogonal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Settings of the mechanics: tissue, closure protocol, contact and numerics."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 
@@ -44,32 +42,18 @@ def smooth_step(u: float) -> float:
 class ExponentialTissue:
     """Coefficients of one region.
 
-    Attributes
-    ----------
-    c0 : float
-        MPa, scale of the exponential.
-    c1, c2 : float
-        Exponents of the isochoric deformation and of the fibres.
-    mu : float
-        MPa, shear modulus at rest. The default is a third of the Young's modulus of 0.06 MPa of
-        excised leaflets before they stiffen (Krishnamurthy et al. 2009, J. Biomech. 42:1909).
-    kappa : float
-        MPa, bulk modulus.
-    viscous : float
-        MPa, viscous stiffness of the damping.
-
-    Raises
-    ------
-    MaterialError
-        If a coefficient is not positive (c1, c2 and viscous may be zero).
+    MaterialError if a coefficient is not positive (c1, c2 and viscous may be zero).
     """
 
-    c0: Modulus
+    c0: Modulus  #: MPa, scale of the exponential
+    #: exponents of the isochoric deformation and of the fibres
     c1: LawExponent
     c2: LawExponent
+    #: MPa, shear modulus at rest. The default is a third of the Young's modulus of 0.06 MPa of
+    #: excised leaflets before they stiffen (Krishnamurthy et al. 2009, J. Biomech. 42:1909).
     mu: Modulus = 0.02
-    kappa: Modulus = 5.0
-    viscous: Modulus = 2.0
+    kappa: Modulus = 5.0  #: MPa, bulk modulus
+    viscous: Modulus = 2.0  #: MPa, viscous stiffness of the damping
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -133,10 +117,7 @@ class TissueSettings:
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of the parameters of the tissue."""
-        kinds = {
-            "exponential": ("E_f", *EXPONENTIAL_KINDS),
-            "stiffening": ("E_f", "stiffening"),
-        }
+        kinds = {"exponential": ("E_f", *EXPONENTIAL_KINDS), "stiffening": ("E_f", "stiffening")}
         own = kinds.get(self.law, ("E_f",))
         return own if self.law == "corotational" else (*own, "prestretch")
 
@@ -285,44 +266,26 @@ class Relaxation:
 
 @dataclass(frozen=True, slots=True)
 class MechanicsSettings:
-    """All settings of the mechanics except valve, mesh and parameters.
+    """All settings of the mechanics except valve, mesh and parameters."""
 
-    Attributes
-    ----------
-    tissue : dict
-        Region name -> :class:`TissueSettings`.
-    protocol, damping, newton, contact
-        See their classes.
-    density : float
-        t/mm^3.
-    support : str
-        ``hinge`` (thickness-averaged annulus) or ``clamp`` (both faces).
-    support_stiffness : float
-        N/mm per mm of annulus.
-    patch_radius : float
-        mm, radius of the patch over which a chord is spread at its insertion.
-    solver : str
-    fields : dict
-        Region name -> :class:`ModulusField` of a varying modulus. Missing coefficients
-        ``field.REGION.K`` are 0.
-    patches : dict
-        Any name -> :class:`StiffPatch`, for simulations.
-    relaxation : Relaxation or None
-        The shape that is free of stress; None: that of the mesh.
-    """
-
-    tissue: dict[str, TissueSettings]
+    tissue: dict[str, TissueSettings]  #: region name -> :class:`TissueSettings`
+    #: see their classes
     protocol: ClosureProtocol = field(default_factory=ClosureProtocol)
     damping: Damping = field(default_factory=Damping)
     newton: NewtonSettings = field(default_factory=NewtonSettings)
     contact: ContactSettings = field(default_factory=ContactSettings)
-    density: Density = 1.04e-9
-    support: str = "hinge"
-    support_stiffness: Stiffness = 50.0
+    density: Density = 1.04e-9  #: t/mm^3
+    support: str = "hinge"  #: ``hinge`` (thickness-averaged annulus) or ``clamp`` (both faces)
+    support_stiffness: Stiffness = 50.0  #: N/mm per mm of annulus
+    #: mm, radius of the patch over which a chord is spread at its insertion
     patch_radius: Length = 2.0
     solver: str = "auto"
+    #: region name -> :class:`ModulusField` of a varying modulus. Missing coefficients
+    #: ``field.REGION.K`` are 0.
     fields: dict[str, ModulusField] = field(default_factory=dict)
+    #: any name -> :class:`StiffPatch`, for simulations
     patches: dict[str, StiffPatch] = field(default_factory=dict)
+    #: the shape that is free of stress; None: that of the mesh
     relaxation: Relaxation | None = None
 
     def __post_init__(self) -> None:

@@ -17,8 +17,6 @@ against constant stress: the patch test holds. With the corotational law the str
 one in a frame that rotates with the element and replaces F.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,24 +51,14 @@ LINEAR = 1e-7
 
 @dataclass(slots=True, eq=False)
 class SolidState:
-    """State of the solid at given nodal positions.
+    """State of the solid at given nodal positions."""
 
-    Attributes
-    ----------
-    green : (e, q, 6)
-        Green-Lagrange strain, enhanced part included.
-    stress, tangent : (e, q, 6) and (e, q, 6, 6) MPa
-    alpha : (e, n_modes)
-        Enhanced parameters.
-    deformation : (e, q, 3, 3)
-        F in the fibre frame.
-    """
-
-    green: FloatArray
+    green: FloatArray  #: (e, q, 6), Green-Lagrange strain, enhanced part included
+    #: (e, q, 6) and (e, q, 6, 6) MPa
     stress: FloatArray
     tangent: FloatArray
-    alpha: FloatArray
-    deformation: FloatArray
+    alpha: FloatArray  #: (e, n_modes), enhanced parameters
+    deformation: FloatArray  #: (e, q, 3, 3), F in the fibre frame
 
 
 class Solid:
@@ -221,16 +209,9 @@ class EdgeRotations:
     is the polar factor of A at x times the inverse of that at rest. This is the "polar" form of
     SOFA's tetrahedra, not the polar factor of the deformation gradient.
 
-    Parameters
-    ----------
-    mesh : SolidMesh
-    frames : ndarray
-        ``(e, 1, 3, 3)`` fibre frames, columns as in :mod:`mvest.mechanics.solid`.
+    InputError if the elements are not linear tetrahedra.
 
-    Raises
-    ------
-    InputError
-        If the elements are not linear tetrahedra.
+    ``frames``: ``(e, 1, 3, 3)`` fibre frames, columns as in :mod:`mvest.mechanics.solid`.
     """
 
     def __init__(self, mesh: SolidMesh, frames: FloatArray) -> None:

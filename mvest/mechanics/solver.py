@@ -369,10 +369,7 @@ class SuperLUSolver:
 def linear_solver(name: str = "auto") -> LinearSolver:
     """The solver ``pardiso``, ``superlu`` or ``auto`` (PARDISO if installed).
 
-    Raises
-    ------
-    InputError
-        If the name is unknown, or PARDISO is requested and not installed.
+    InputError if the name is unknown, or PARDISO is requested and not installed.
     """
     if name not in ("auto", "pardiso", "superlu"):
         raise InputError(f"unknown linear solver {name!r}; known: auto, pardiso, superlu")

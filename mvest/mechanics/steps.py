@@ -1,7 +1,5 @@
 """Input and result of a simulation: steps, settings, frames, reasons."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 
@@ -63,48 +61,27 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """Statistics of one accepted (sub)step.
+    """Statistics of one accepted (sub)step."""
 
-    Attributes
-    ----------
-    time, dt : float
-        s.
-    residuals : tuple of float
-        Relative residual before each iteration and after the last.
-    active_contacts : int
-        Pairs within reach.
-    halvings : int
-        Halvings of the step, or rests before a static step.
-    """
-
+    #: s
     time: float
     dt: float
-    residuals: tuple[float, ...]
-    active_contacts: int
-    halvings: int
+    residuals: tuple[float, ...]  #: relative residual before each iteration and after the last
+    active_contacts: int  #: pairs within reach
+    halvings: int  #: halvings of the step, or rests before a static step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """Result of a forward run; a failure is a value.
+    """Result of a forward run; a failure is a value."""
 
-    Attributes
-    ----------
-    times : (f,) s
-        Of the completed steps, the initial state first.
-    frames, sensitivities : (f, n, 3) mm and (f, p, n, 3) mm per unit of each parameter
-    reason : StepReason
-    records : tuple of StepRecord
-    solver : str
-        The solver of the linear systems, and its substitutes.
-    """
-
-    times: FloatArray
+    times: FloatArray  #: (f,) s, of the completed steps, the initial state first
+    #: (f, n, 3) mm and (f, p, n, 3) mm per unit of each parameter
     frames: FloatArray
     sensitivities: FloatArray
     reason: StepReason
     records: tuple[StepRecord, ...]
-    solver: str = ""
+    solver: str = ""  #: the solver of the linear systems, and its substitutes
 
     @property
     def converged(self) -> bool:

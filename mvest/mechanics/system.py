@@ -5,8 +5,6 @@ The residual is the internal minus the external force, so that equilibrium is ``
 inertia and mass-proportional damping. The tangent is dr/dx, exact in every term.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -40,26 +38,16 @@ _NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loads:
-    """Prescribed loads and positions at one instant.
+    """Prescribed loads and positions at one instant."""
 
-    Attributes
-    ----------
-    pressure : float
-        MPa.
-    tips, hinge, fixed : (n_tips, 3), (h, 3) and (n_fixed, 3) mm
-        Papillary tips, targets of the hinge points, and fixed nodes.
-    body_force : (n, 3) N or None
-        Dead nodal forces.
-    tie_lengths : (k,) mm or None
-        Force-free lengths of the ties.
-    """
-
-    pressure: float = 0.0
+    pressure: float = 0.0  #: MPa
+    #: (n_tips, 3), (h, 3) and (n_fixed, 3) mm, papillary tips, targets of the hinge points, and
+    #: fixed nodes
     tips: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     hinge: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     fixed: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    body_force: FloatArray | None = None
-    tie_lengths: FloatArray | None = None
+    body_force: FloatArray | None = None  #: (n, 3) N or None, dead nodal forces
+    tie_lengths: FloatArray | None = None  #: (k,) mm or None, force-free lengths of the ties
 
 
 @dataclass(frozen=True, slots=True, eq=False)

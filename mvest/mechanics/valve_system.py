@@ -4,8 +4,6 @@ Everything is defined in the reference frame and embedded, so that loads, contac
 do not depend on the mesh.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -67,6 +65,9 @@ def build_system(
 ) -> System:
     """A system of the valve in the given mesh.
 
+    InputError if a region has no tissue or no modulus, or there is no such parameter. MaterialError
+    if a modulus is inadmissible.
+
     Parameters
     ----------
     valve : Valve
@@ -81,13 +82,6 @@ def build_system(
     ties : TiedPoints, optional
     relaxed : (e, q, 6), optional
         See `material_law`.
-
-    Raises
-    ------
-    InputError
-        If a region has no tissue or no modulus, or there is no such parameter.
-    MaterialError
-        If a modulus is inadmissible.
     """
     check_parameters(values, valve, settings)
     chordae = valve.chordae
@@ -159,6 +153,9 @@ def material_law(
 ) -> Law:
     """The law of the mesh.
 
+    InputError if a region has no tissue or no modulus, or a value is of another region.
+    MaterialError if a modulus is inadmissible.
+
     Parameters
     ----------
     mesh : SolidMesh
@@ -170,13 +167,6 @@ def material_law(
         From `variation_of`; by default the moduli are constant within each leaflet.
     relaxed : (e, q, 6), optional
         Green-Lagrange strain of the shape that is free of stress, by default the mesh's.
-
-    Raises
-    ------
-    InputError
-        If a region has no tissue or no modulus, or a value is of another region.
-    MaterialError
-        If a modulus is inadmissible.
     """
     regions = mesh.region_names
     kinds = {settings.tissue[region].law for region in regions if region in settings.tissue}
@@ -374,10 +364,7 @@ def held_loading(
 ) -> Callable[[float], Loads]:
     """Time -> the constant loads of a further frame.
 
-    Raises
-    ------
-    InputError
-        If the numbers of annulus points or tips are not those of the valve.
+    InputError if the numbers of annulus points or tips are not those of the valve.
     """
     rest = contact_valve.motion.annulus[0]
     for name, given, own in (

@@ -6,8 +6,6 @@ another follows from the observation itself (see `mvest.estimation.noise` and
 `mvest.estimation.evidence`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,34 +34,21 @@ class ErrorBeliefs:
     """Uncertainty of the stated errors; factors are one standard deviation.
 
     The defaults are weak: twice or half the stated size or length is not unusual.
-
-    Attributes
-    ----------
-    std_factor, length_factor : float
-        Of the stated standard deviation and correlation length.
-    length_mm : float
-        Median correlation length of errors that are stated to be independent.
-    deviation : float
-        Of a single band from the spectrum of the two.
-    other_share : float
-        Median of the part that is not stated, as a share of the stated standard deviation: the
-        rough part of correlated errors, the smooth part of independent ones.
-    other_factor : float
-        Of that part.
-    frame_factor : float
-        Of each frame before the last, relative to its stated errors.
-    resolution_mm : float
-        Smallest standard deviation of a single point: neither meshes nor images are finer, and
-        errors without any roughness would teach from infinite detail.
     """
 
+    #: of the stated standard deviation and correlation length
     std_factor: Factor = 2.0
     length_factor: Factor = 2.0
+    #: median correlation length of errors that are stated to be independent
     length_mm: Length = 10.0
-    deviation: Factor = 1.65
+    deviation: Factor = 1.65  #: of a single band from the spectrum of the two
+    #: median of the part that is not stated, as a share of the stated standard deviation: the rough
+    #: part of correlated errors, the smooth part of independent ones
     other_share: Share = 0.2
-    other_factor: Factor = 3.0
-    frame_factor: Factor = 1.5
+    other_factor: Factor = 3.0  #: of that part
+    frame_factor: Factor = 1.5  #: of each frame before the last, relative to its stated errors
+    #: smallest standard deviation of a single point: neither meshes nor images are finer, and
+    #: errors without any roughness would teach from infinite detail
     resolution_mm: Length = 0.02
 
     def __post_init__(self) -> None:

@@ -52,10 +52,7 @@ UNKNOWN = -1
 class ObservedSurface:
     """One frame seen without correspondence.
 
-    Raises
-    ------
-    InputError
-        On wrong shapes, values that are not finite, and curves whose points coincide.
+    InputError on wrong shapes, values that are not finite, and curves whose points coincide.
     """
 
     frame: str  #: name of the frame that the model predicts
@@ -195,11 +192,8 @@ class SurfaceObservation:
     The observation of each frame is the distances of its points, then two components of each point
     of the free edge. The model predicts these distances; zero is observed.
 
-    Raises
-    ------
-    InputError
-        On inadmissible standard deviations, frames, or curves and leaflets that the model's surface
-        does not have.
+    InputError on inadmissible standard deviations, frames, or curves and leaflets that the model's
+    surface does not have.
     """
 
     #: tuple of ObservedSurface, (f,), one for each observed frame, the closed one last
@@ -255,10 +249,7 @@ class SurfaceObservation:
 
         ``aux`` of a prediction are the observed frames with all vertices, (f, n, 3) mm.
 
-        Parameters
-        ----------
-        model : ObservationModel
-            Predicts the stacked positions ``(3 n f,)`` mm of all frames of ``predicted``.
+        ``model``: predicts the stacked positions ``(3 n f,)`` mm of all frames of ``predicted``.
         """
         observed, n = observed_frames(model, self.frames, None, self.predicted), self.surface.size
 

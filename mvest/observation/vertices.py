@@ -1,7 +1,5 @@
 """Observations of corresponding vertices, and what a model predicts of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -175,10 +173,7 @@ def select_frames(
 def vertex_sets(columns: int, rows: int) -> dict[str, BoolArray]:
     """Sets of vertices that might be seen, out of ``columns x rows``, annulus first; each ``(n,)``.
 
-    Parameters
-    ----------
-    columns, rows : int
-        Vertices around the valve, and from the annulus to the free edge.
+    ``columns, rows``: vertices around the valve, and from the annulus to the free edge.
     """
     row, column = np.divmod(np.arange(columns * rows), columns)
     way = row / (rows - 1)

@@ -1,7 +1,5 @@
 """Personalisation of a case: generic valve, estimation, comparison with its frames, details."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the closed valve of a case is like, and by which tissue its moduli are known."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mvest.closure.physiology import closed_loads, modulus_parts, physiology, resistance_rows

@@ -8,8 +8,6 @@ errors, but errors of pressures, chordae, displacement and geometry are common t
 are a few small matrices from one set of closures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Diagnostics of a personalised case, from which its verdict follows."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import coo_matrix, csr_array
 from scipy.spatial import cKDTree

@@ -124,10 +124,7 @@ class FrameErrors:
         return family.without_columns().at(log, beats)
 
     def noise(
-        self,
-        learned: LearnedNoise | None = None,
-        *,
-        without: Collection[str] = (),
+        self, learned: LearnedNoise | None = None, *, without: Collection[str] = ()
     ) -> ObservationNoise:
         """Noise of the observation except for error samples and the sources ``without``."""
         base = self.single_noise(learned)
@@ -269,10 +266,7 @@ def linearise(
 def with_samples(errors: FrameErrors, valve: ClosedValve) -> FrameErrors:
     """The errors with the effect of the case's error samples about a closed valve.
 
-    Raises
-    ------
-    GeometryError
-        If that cannot be computed.
+    GeometryError if that cannot be computed.
     """
     case = errors.fitted.case
     found = sample_frames(case, valve)

@@ -25,21 +25,11 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import Prediction, of_some, predict
 from mvest.estimation.run import Filter
 from mvest.estimation.transform import Log, to_filter
-from mvest.personalisation.errors import (
-    FrameErrors,
-    WeighedObservation,
-    linearise,
-    with_samples,
-)
+from mvest.personalisation.errors import FrameErrors, WeighedObservation, linearise, with_samples
 from mvest.personalisation.fitted_frames import FittedFrames
 from mvest.personalisation.geometry import displacement
 from mvest.personalisation.joint import JointPosterior, damped_step
-from mvest.personalisation.model import (
-    CaseClosure,
-    build_model,
-    held_state,
-    with_pressures,
-)
+from mvest.personalisation.model import CaseClosure, build_model, held_state, with_pressures
 from mvest.personalisation.settings import STIFFENS, PersonaliseSettings, Prior
 from mvest.personalisation.sources import ClosedValve
 from mvest.problem.estimate import Observed, Problem, StudyResult, estimate
@@ -119,11 +109,8 @@ class CaseProblem:
 
         ``model`` comes from `build_model` and may have been closed.
 
-        Raises
-        ------
-        InputError
-            If the case lacks an unknown, has error samples and several fitted frames, or errors of
-            pressures are unknown but their common factor is not.
+        InputError if the case lacks an unknown, has error samples and several fitted frames, or
+        errors of pressures are unknown but their common factor is not.
         """
         settings = with_pressures(case, settings)
         if case.fitted and case.error_samples is not None:

@@ -4,8 +4,6 @@ Corresponding vertices are compared one by one. Otherwise the points of a frame 
 the predicted surface, refined and smoothed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ Open shape, annulus, papillary tips, thickness and fibre direction are measured 
 errors. `mvest.personalisation.sources` computes what the modes do to a prediction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -203,30 +201,45 @@ def rest_lengths_by_ends(
 ) -> FloatArray | None:
     """Relative change ``(q, k)`` of rest lengths that were laid out from the frames.
 
-    They are proportional to a chord's length in the closed frame, or in the open frame if that
-    needs more (`mvest.cases.tissue.lay_out_chordae`). A trunk changes as the mean of its branches.
-    A closed frame without correspondence does not show the insertions, so the open frame replaces
-    it. None if rest lengths were stated.
+    They are proportional to the lengths in the closed frame. A tree of chordae that the open frame
+    needs longer is longer by the ratio of its tightest way from tip to leaflet in both frames
+    (`mvest.valve.anatomy.template.laid_out`). A closed frame without correspondence does not show
+    the insertions, so the open frame replaces it. None if rest lengths were stated.
 
-    Parameters
-    ----------
-    open_moves, closed_moves : (q, c, 3) mm
-        Displacement of the insertion of each chord relative to its tip in these frames.
+    ``open_moves, closed_moves`` ``(q, c, 3) mm``: displacement of the insertion of each chord
+    relative to its tip in these frames.
     """
     if not case.chordae_follow:
         return None
     closed, surface, chordae = case.frame(Role.CLOSED), case.surface, case.chordae
-    tips = np.asarray(case.frame(Role.REFERENCE).papillary_tips)
+    c, tips = len(chordae.insertion), np.asarray(case.frame(Role.REFERENCE).papillary_tips)
     away = chordae.insertion - tips[chordae.end_tip]
-    moves = open_moves
-    if closed.corresponds:
-        place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
-        ends = place.interpolate(closed.vertices, surface.triangles)
-        in_closed = ends - np.asarray(closed.papillary_tips)[chordae.end_tip]
-        by_open = ChordLayout().open_slack * np.linalg.norm(away, axis=1)
-        by_closed = (chordae.along(chordae.rest_length) > (1 + 1e-6) * by_open)[:, None]
-        away = np.where(by_closed, in_closed, away)
-        moves = np.where(by_closed, closed_moves, open_moves)
-    change = np.einsum("qci,ci->qc", moves, away) / np.sum(away**2, axis=1)
-    through = chordae.paths[: len(away)]
-    return np.asarray(change @ through / through.sum(axis=0))
+    # Segments as sums of the vectors from the tips to the leaflet ends beyond them.
+    through = chordae.paths
+    parts = (through[:c] / through[:c].sum(axis=0)).T
+    reach = np.linalg.norm(parts[c:] @ away, axis=1)
+    fork = np.linalg.norm(chordae.junction - tips[chordae.tip[c:]], axis=1)
+    parts[c:] *= (fork / reach)[:, None]
+    branch = chordae.parent >= 0
+    parts[branch] -= parts[c + chordae.parent[branch]]
+
+    def changes(ends: FloatArray, moves: FloatArray) -> tuple[FloatArray, ...]:
+        """Lengths of segments and ways, and the relative changes of both."""
+        arms = parts @ ends
+        length = np.linalg.norm(arms, axis=1)
+        longer = np.einsum("qki,ki->qk", parts @ moves, arms) / length
+        way = chordae.along(length)
+        return length, way, longer / length, longer @ through[:c].T / way
+
+    _, way, change, way_change = changes(away, open_moves)
+    if not closed.corresponds:
+        return change
+    place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
+    ends = place.interpolate(closed.vertices, surface.triangles)
+    ends -= np.asarray(closed.papillary_tips)[chordae.end_tip]
+    length, closed_way, change, closed_change = changes(ends, closed_moves)
+    root = np.argmax(through & ~branch, axis=1)
+    least = ChordLayout().open_slack * way / closed_way
+    tightest = np.argmax(np.where(root[:, None] == root[:c], least, 0.0), axis=1)
+    by_open = chordae.rest_length <= (1 + 1e-6) * length * least[tightest]
+    return change + np.where(by_open, (way_change - closed_change)[:, tightest], 0.0)

@@ -1,7 +1,5 @@
 """The joint posterior of a case's parameters and the errors of its geometry."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

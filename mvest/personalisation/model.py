@@ -56,17 +56,10 @@ def build_model(
 ) -> ClosureModel:
     """The closure of a case as a function of its unknowns except for the registration.
 
-    Parameters
-    ----------
-    store : Path, optional
-        Folder in which an unstructured mesh is cached.
+    InputError if an unknown is not one of the case's, or a modulus is missing. GeometryError or
+    MeshingError if the leaflets cannot be meshed.
 
-    Raises
-    ------
-    InputError
-        If an unknown is not one of the case's, or a modulus is missing.
-    GeometryError, MeshingError
-        If the leaflets cannot be meshed.
+    ``store``: folder in which an unstructured mesh is cached.
     """
     coarse = build_coarse(case, settings, store)
     solid = _solid(GivenValve(case.valve), settings.mesh, store)

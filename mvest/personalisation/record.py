@@ -29,8 +29,6 @@ image_step     with image_frames and pictures: `DetectedValve.details`
 ============== ==================================================================================
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
@@ -43,15 +41,7 @@ from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.result import Personalised
 from mvest.problem.estimate import StudyResult
 from mvest.problem.fields import as_stored, chord_fields
-from mvest.problem.record import (
-    EstimateRecord,
-    FrameFit,
-    Numbers,
-    Row,
-    Spread,
-    finite,
-    record_of,
-)
+from mvest.problem.record import EstimateRecord, FrameFit, Numbers, Row, Spread, finite, record_of
 from mvest.problem.verdict import judge
 from mvest.valve.measure.clinical import clinical_measurements
 

@@ -1,7 +1,5 @@
 """Results of a personalisation and of its prediction."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Settings of a personalisation: unknowns with priors, mesh, filter and sources of error."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
@@ -187,10 +185,7 @@ def with_stiffening(settings: PersonaliseSettings) -> PersonaliseSettings:
 
     The unknown leads from the linear law to that of `PersonaliseSettings.nuisance_law`.
 
-    Raises
-    ------
-    InputError
-        If there is no such leaflet or no such law, or its tissue is not linear.
+    InputError if there is no such leaflet or no such law, or its tissue is not linear.
     """
     tissue, laws = dict(settings.mechanics.tissue), dict(settings.nuisance_law)
     for unknown in settings.unknowns:

@@ -10,8 +10,6 @@ change of its closed frame is one sample of the error of the innovation. Errors 
 move both frames as a whole cancel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -164,18 +164,15 @@ def expected_intervals(
 ) -> list[dict[str, Any]]:
     """The 95 % interval of each unknown around its generic value, before and after an estimation.
 
+    Returns a list of dicts: ``name``, ``unit``, ``generic``, ``low_before``, ``high_before``,
+    ``low``, ``high``, and ``width``: ``after / before``.
+
     Parameters
     ----------
     names : sequence of str, (p,)
     generic : (p,)
     before, after : (p,)
         Standard deviations in filter coordinates.
-
-    Returns
-    -------
-    list of dict
-        ``name``, ``unit``, ``generic``, ``low_before``, ``high_before``, ``low``, ``high``, and
-        ``width``: ``after / before``.
     """
     z, reach = transform.forward(generic), float(ndtri(0.975))
     columns = {"name": list(names), "unit": list(map(unit_of, names)), "generic": generic.tolist()}

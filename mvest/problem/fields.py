@@ -3,8 +3,6 @@
 All drawings of a case read them here. Arrays that a run did not store are None.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -145,6 +143,8 @@ def valve_fields(valve: Valve, frames: Sequence[str]) -> dict[str, NDArray[Any]]
 def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> CaseFields:
     """The fields of a case, rotated: z to the atrium, the first leaflet towards positive y.
 
+    InputError if arrays are missing or cannot be read.
+
     Parameters
     ----------
     arrays : mapping or Path
@@ -152,11 +152,6 @@ def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> Cas
         their ``.npz`` file.
     turned : bool
         False: keep the axes of the case.
-
-    Raises
-    ------
-    InputError
-        If arrays are missing or cannot be read.
     """
     where = "arrays"
     try:

@@ -5,8 +5,6 @@ points of the leaflets displaces them against this boundary and biases every mod
 parameter: predicted closed frames are rotated and shifted before the comparison.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -102,17 +100,14 @@ def _turn_derivatives(vector: FloatArray) -> FloatArray:
 class RegisteredModel:
     """A closure that displaces all predicted frames except the open one.
 
+    InputError if the names do not match.
+
     Parameters
     ----------
     model : ClosureModel or FramesModel
         Predicts the open frame and closed ones.
     names : tuple of str, (p,)
         Those of the model in its order, mixed with some of ``REGISTRATION``.
-
-    Raises
-    ------
-    InputError
-        If the names do not match.
     """
 
     def __init__(self, model: ClosureModel | FramesModel, names: tuple[str, ...]) -> None:

@@ -3,8 +3,6 @@
 The key of a cache entry combines its input values and the code that made it (:mod:`mvest.cache`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,10 +25,7 @@ DIGITS = 32
 def key_of(described: Mapping[str, Any], made_by: tuple[Any, ...]) -> str:
     """Key of plain input values and the modules, functions or classes that use them.
 
-    Raises
-    ------
-    InputError
-        If a value has no JSON form, or code belongs to another package.
+    InputError if a value has no JSON form, or code belongs to another package.
     """
     return config_hash({"made_from": described, "source": source_key(*made_by)})[:DIGITS]
 
@@ -62,10 +57,7 @@ class StoredModel:
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Prediction at ``m (p,)``; its Jacobian is zero if it was read from disk.
 
-        Raises
-        ------
-        InputError
-            If the cache cannot be written.
+        InputError if the cache cannot be written.
         """
 
         def read(path: Path) -> Prediction:

@@ -1,7 +1,5 @@
 """Synthetic observations made from a known truth. Filters never receive the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -45,6 +43,8 @@ def simulate_observation(
 ) -> TwinData:
     """Make a synthetic observation; without one, and with the model's reason, if the model fails.
 
+    InputError on inadmissible errors, frames or values.
+
     Parameters
     ----------
     model : ObservationModel
@@ -60,11 +60,6 @@ def simulate_observation(
         Of the errors, as the filter assumes it; None for independent errors.
     errors : sequence of ObservationError
         Applied to the truth in this order.
-
-    Raises
-    ------
-    InputError
-        On inadmissible errors, frames or values.
     """
     values = np.asarray(values, dtype=np.float64)
     if values.shape != (len(parameters),):

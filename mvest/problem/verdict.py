@@ -13,8 +13,6 @@ new seeds must confirm it. Two checks were dropped because they predicted no mis
 the fitted valve from the closed frame, and how much the data narrow the prior.
 """
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -93,10 +91,7 @@ class Check:
 def judge(seen: Mapping[str, Found]) -> Verdict:
     """The verdict on an estimate.
 
-    Parameters
-    ----------
-    seen : mapping
-        Key of `CHECKS` -> what was found. Checks without a key count as missing.
+    ``seen``: key of `CHECKS` -> what was found. Checks without a key count as missing.
     """
     failed_checks: list[FailedCheck] = []
     missing: list[str] = []

@@ -5,8 +5,6 @@ and deep nesting raise an error. Only decimal literals are numbers; hexadecimal,
 sexagesimal literals, those with underscores, and dates are text.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter
@@ -26,10 +24,8 @@ M = TypeVar("M", bound=BaseModel)
 def read_mapping(path: Path, max_size: int = MAX_TEXT, where: str = "") -> dict[str, Any]:
     """Read the mapping in a JSON file; ``where`` names it in errors (default: its path).
 
-    Raises
-    ------
-    InputError
-        The file cannot be read, is larger than ``max_size`` bytes, or holds something else.
+    InputError if the file cannot be read, is larger than ``max_size`` bytes, or holds something
+    else.
     """
     data = parse_json(read_bytes(path, max_size, where), where or str(path))
     if not isinstance(data, dict):
@@ -40,10 +36,7 @@ def read_mapping(path: Path, max_size: int = MAX_TEXT, where: str = "") -> dict[
 def validated(schema: type[M], data: Any, where: str) -> M:
     """Convert plain data to an instance of a schema; ``where`` names the data in errors.
 
-    Raises
-    ------
-    InputError
-        A field is missing, or does not fit the schema.
+    InputError if a field is missing, or does not fit the schema.
     """
     try:
         return schema.model_validate(data)
@@ -56,10 +49,7 @@ def validated(schema: type[M], data: Any, where: str) -> M:
 def parse_json(content: bytes | str, where: str) -> Any:
     """Parse JSON text; ``where`` names it in errors.
 
-    Raises
-    ------
-    InputError
-        The text is not JSON, or contains NaN, an infinity, or half of a surrogate pair.
+    InputError if the text is not JSON, or contains NaN, an infinity, or half of a surrogate pair.
     """
     try:
         text = content if isinstance(content, str) else content.decode("utf-8-sig")
@@ -124,11 +114,8 @@ for _kind in ("str", "int", "float"):
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a file that holds one mapping.
 
-    Raises
-    ------
-    InputError
-        The file is missing, too large, or not a YAML mapping; or it has tags, aliases, repeated
-        keys, deep nesting, or text or numbers beyond the bounds.
+    InputError if the file is missing, too large, or not a YAML mapping; or it has tags, aliases,
+    repeated keys, deep nesting, or text or numbers beyond the bounds.
     """
     text = read_text(path, MAX_FILE_SIZE)
     try:

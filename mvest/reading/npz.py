@@ -1,7 +1,5 @@
 """Reads plain arrays from NumPy's ``.npz``; checks the stated sizes before allocating any."""
 
-from __future__ import annotations
-
 import tokenize
 import zipfile
 import zlib
@@ -37,6 +35,9 @@ def read_npz(
 ) -> dict[str, NDArray[Any]]:
     """Read the arrays in a file, in native byte order; pickled objects are errors.
 
+    InputError if the file is missing or damaged, lacks an array or has others, or declares more
+    than `MAX_BYTES`.
+
     Parameters
     ----------
     path : Path or binary stream
@@ -48,12 +49,6 @@ def read_npz(
         Further arrays to read if present.
     where : str
         Name of the file in errors; its path by default.
-
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, lacks an array or has others, or declares more than
-        `MAX_BYTES`.
     """
     where = where or str(path)
     try:
@@ -106,10 +101,7 @@ def check_array(
 
     A length of None matches any. ``where`` names the array in errors.
 
-    Raises
-    ------
-    InputError
-        The kind or shape differs, or a number is not finite.
+    InputError if the kind or shape differs, or a number is not finite.
     """
     sizes = zip(shape, array.shape, strict=False)
     fits = array.ndim == len(shape) and all(want in (None, have) for want, have in sizes)

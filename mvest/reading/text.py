@@ -1,7 +1,5 @@
 """Reads bytes, text, numbers and small comma-separated tables from users, within bounds."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -33,10 +31,7 @@ _UNWRITABLE = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\uff
 def read_bytes(path: Path, max_size: int = MAX_TEXT, where: str = "") -> bytes:
     """Read a file; ``where`` names it in errors (default: its path).
 
-    Raises
-    ------
-    InputError
-        The file is missing, irregular, not readable, or larger than ``max_size`` bytes.
+    InputError if the file is missing, irregular, not readable, or larger than ``max_size`` bytes.
     """
     where = where or str(path)
     try:
@@ -59,10 +54,7 @@ def read_bytes(path: Path, max_size: int = MAX_TEXT, where: str = "") -> bytes:
 def read_text(path: Path, max_size: int = MAX_TEXT, where: str = "") -> str:
     """Read a UTF-8 file, with or without a byte order mark.
 
-    Raises
-    ------
-    InputError
-        As `read_bytes`, or the file is not UTF-8.
+    InputError as `read_bytes`, or the file is not UTF-8.
     """
     try:
         return read_bytes(path, max_size, where).decode("utf-8-sig")
@@ -73,10 +65,7 @@ def read_text(path: Path, max_size: int = MAX_TEXT, where: str = "") -> str:
 def number(text: str, max_abs: float = MAX_NUMBER) -> float:
     """Parse a finite decimal number; underscores, hexadecimal and sexagesimal digits are errors.
 
-    Raises
-    ------
-    InputError
-        The text is not such a number, or its magnitude exceeds ``max_abs``.
+    InputError if the text is not such a number, or its magnitude exceeds ``max_abs``.
     """
     plain = text.strip()
     value = float(plain) if len(plain) <= _MAX_DIGITS and _NUMBER.fullmatch(plain) else math.nan
@@ -89,11 +78,8 @@ def number(text: str, max_abs: float = MAX_NUMBER) -> float:
 def check_words(text: str, max_length: int = MAX_WORDS) -> str:
     """Return the text if all output formats can represent it.
 
-    Raises
-    ------
-    InputError
-        The text has control characters other than line ends and tabs, halves of surrogate pairs, or
-        more than ``max_length`` characters.
+    InputError if the text has control characters other than line ends and tabs, halves of surrogate
+    pairs, or more than ``max_length`` characters.
     """
     if len(text) > max_length:
         raise InputError(f"{len(text)} characters, expected at most {max_length}")
@@ -114,10 +100,7 @@ def one_line(text: object, max_length: int = MAX_LINE) -> str:
 def refusing(path: Path, what: str) -> Iterator[None]:
     """Turn every exception into a one-line error of this package that names the file.
 
-    Raises
-    ------
-    MvestError
-        As raised within, cut to `MAX_LINE` characters; an `InputError` for everything else.
+    MvestError as raised within, cut to `MAX_LINE` characters; an `InputError` for everything else.
     """
     try:
         yield
@@ -146,11 +129,8 @@ def read_columns(
 
     ``where`` names the file in errors (default: its path). The optional columns come together.
 
-    Raises
-    ------
-    InputError
-        The file is unreadable or not text, its header is wrong, it has no rows, or a row is too
-        short or too long.
+    InputError if the file is unreadable or not text, its header is wrong, it has no rows, or a row
+    is too short or too long.
     """
     where = where or str(file)
     text = read_text(file, where=where)
@@ -213,10 +193,7 @@ def read_vertices(file: Path) -> IntArray:
 def write_columns(file: Path, names: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a table; numbers are written with all digits.
 
-    Raises
-    ------
-    InputError
-        The file cannot be written.
+    InputError if the file cannot be written.
     """
     try:
         with file.open("w", encoding="utf-8", newline="") as stream:

@@ -4,8 +4,6 @@ The Fisher information needs a model, a parameter set and the errors of the obse
 observed value. One run of the model therefore says which intervals to expect.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -83,11 +81,7 @@ def unknown_text(title: str, reason: str) -> str:
 def trade_off_text(group: TradeOff, labels: Mapping[str, str] | None = None) -> str:
     """One sentence about parameters that the data hardly distinguish.
 
-    Parameters
-    ----------
-    group : TradeOff
-    labels : mapping, optional
-        Labels of the parameters.
+    ``labels``: labels of the parameters.
     """
     labelled = [(labels or {}).get(name, name) for name in group.parameters]
     moved = []

@@ -176,10 +176,7 @@ def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
 def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False) -> list[Path]:
     """Write ``base.png``, and ``base.pdf`` for print, with a provenance line in foot and metadata.
 
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
+    InputError if a file cannot be written.
     """
     _show_texts(figure)
     line = shown_text(line, LONGEST_LINE)

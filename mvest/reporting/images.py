@@ -4,8 +4,6 @@ The slices lie in the usual planes of a mitral valve. All positions are LPS mm; 
 coordinates, mm to the right and up from its origin.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -120,16 +118,10 @@ def draw_candidate(
 # -- the valve on slices of the volume ------------------------------------------------------------
 @dataclass(frozen=True, slots=True, eq=False)
 class SlicePlane:
-    """A plane with its own axes.
+    """A plane with its own axes."""
 
-    Attributes
-    ----------
-    origin : (3,) mm
-    right, up : (3,)
-        Orthonormal.
-    """
-
-    origin: FloatArray
+    origin: FloatArray  #: (3,) mm
+    #: (3,), orthonormal
     right: FloatArray
     up: FloatArray
 
@@ -152,10 +144,7 @@ def valve_planes(valve: ValveSequence, frame: int) -> dict[str, SlicePlane]:
     anterior side up: one through the centre of the annulus, and one 1 mm above the middle of the
     higher free edge, which cuts both leaflets.
 
-    Raises
-    ------
-    GeometryError
-        Positions are not finite, or are on one line.
+    GeometryError if positions are not finite, or are on one line.
     """
     named, tips = landmarks(valve, frame), valve.tips[frame]
     if not (np.isfinite(valve.vertices[frame]).all() and np.isfinite(tips).all()):
@@ -187,10 +176,7 @@ def _across(direction: FloatArray, axis: FloatArray) -> FloatArray:
 def resample(volume: VolumeSequence, frame: int, plane: SlicePlane, extent: Extent) -> FloatArray:
     """A trilinearly interpolated slice of one frame.
 
-    Returns
-    -------
-    (rows, columns)
-        Pixels of `STEP_MM` from the bottom up; NaN outside the volume.
+    Returns ``(rows, columns)`` pixels of `STEP_MM` from the bottom up; NaN outside the volume.
     """
     across, up = (
         low + (np.arange(round((high - low) / STEP_MM)) + 0.5) * STEP_MM
@@ -238,6 +224,8 @@ def montage_figure(
     Every row has the planes of its own frame, and all panels have one scale. Leaflets are drawn
     where the plane cuts them, annulus points and papillary tips if they are within 3 mm of it.
 
+    InputError if numbers or times of the frames differ.
+
     Parameters
     ----------
     volume, valve
@@ -247,11 +235,6 @@ def montage_figure(
         A frame to be shown.
     low_confidence : float
         Frames below this are marked in words and by a dashed frame.
-
-    Raises
-    ------
-    InputError
-        Numbers or times of the frames differ.
     """
     count, low = len(valve.times), ~(valve.frame_confidence >= low_confidence)
     if len(volume.times) != count or not np.allclose(

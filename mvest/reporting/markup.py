@@ -3,8 +3,6 @@
 Names of runs and reasons of failures are text of users and libraries, which must not act as markup.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -40,21 +40,15 @@ def prior_alone(unknown: Unknown) -> Unknown:
 def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
     """Coverage and errors of estimates, compared with the generic guess and the prior.
 
-    Parameters
-    ----------
-    unknowns : sequence of Unknown
-        At least one, of one kind, with their truths; of one valve or of many.
+    Returns a dict: ``n`` unknowns, how many were ``estimated`` and how many have the truth
+    ``inside`` their 95 % interval; ``coverage`` (%) with exact 95 % bounds; ``mean square`` of
+    errors in posterior standard deviations, which is 1 for intervals of the right width. Errors and
+    the ``mean width`` of intervals are in ``unit``: in % of the truth for moduli and factors, else
+    in the unknown's unit. The generic guess has its median error for the same unknowns and for all.
+    ``relative width`` is the median over the estimate, and ``width over prior`` the median ratio of
+    logarithmic widths. None: not known.
 
-    Returns
-    -------
-    dict
-        ``n`` unknowns, how many were ``estimated`` and how many have the truth ``inside`` their
-        95 % interval; ``coverage`` (%) with exact 95 % bounds; ``mean square`` of errors in
-        posterior standard deviations, which is 1 for intervals of the right width. Errors and the
-        ``mean width`` of intervals are in ``unit``: in % of the truth for moduli and factors, else
-        in the unknown's unit. The generic guess has its median error for the same unknowns and for
-        all. ``relative width`` is the median over the estimate, and ``width over prior`` the median
-        ratio of logarithmic widths. None: not known.
+    ``unknowns``: at least one, of one kind, with their truths; of one valve or of many.
     """
     unit = "" if unknowns[0].is_modulus else unknowns[0].unit
     prior = [prior_alone(own) for own in unknowns]
@@ -226,10 +220,7 @@ def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure
 
     Each modulus has a panel, and each group a band in which truths rise downwards.
 
-    Parameters
-    ----------
-    groups : mapping
-        Name -> moduli with known truths, each with its verdict in a word.
+    ``groups``: name -> moduli with known truths, each with its verdict in a word.
     """
     from mvest.reporting.figures import panels
 

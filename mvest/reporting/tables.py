@@ -26,34 +26,17 @@ WIDTH, MOST_BESIDE = 100, 5
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Meaning of a column, and how readers see it.
+    """Meaning of a column, and how readers see it."""
 
-    Attributes
-    ----------
-    unit : str
-        Empty if it has none.
-    digits : str
-        Format specification such as ``.2f``; empty: three significant digits.
-    std : str
-        Column of standard deviations, shown as ``value ± std``.
-    low, high : str
-        Columns of the ends of an interval, shown as ``value (low to high)``.
-    truth : str
-        Column of true values; an interval that misses it is marked with a cross.
-    label : str
-        Heading for readers; empty: the name with spaces for underscores.
-    hidden : bool
-        Whether only files for programs have the column.
-    """
-
-    unit: str = ""
-    digits: str = ""
-    std: str = ""
+    unit: str = ""  #: empty if it has none
+    digits: str = ""  #: format specification such as ``.2f``; empty: three significant digits
+    std: str = ""  #: column of standard deviations, shown as ``value ± std``
+    #: columns of the ends of an interval, shown as ``value (low to high)``
     low: str = ""
     high: str = ""
-    truth: str = ""
-    label: str = ""
-    hidden: bool = False
+    truth: str = ""  #: column of true values; an interval that misses it is marked with a cross
+    label: str = ""  #: heading for readers; empty: the name with spaces for underscores
+    hidden: bool = False  #: whether only files for programs have the column
 
     def text(self, value: Any) -> str:
         """One value as a reader sees it."""
@@ -188,6 +171,8 @@ class Table:
 def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
     """A table from a data frame, or from rows that are mappings or dataclasses.
 
+    InputError if there are rows without a named column, or without one that belongs to it.
+
     Parameters
     ----------
     rows : iterable or DataFrame
@@ -195,11 +180,6 @@ def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
     **columns : Column or str
         Meaning of columns, in the order in which they come first; a text is
         ``unit:digits:label``, such as ``"mm:.2f"``, whose last parts may be missing.
-
-    Raises
-    ------
-    InputError
-        If there are rows without a named column, or without one that belongs to it.
     """
     plain = _plain_rows(rows)
     names = list(dict.fromkeys(name for row in plain for name in row))

@@ -1,7 +1,5 @@
 """Measures of a closing valve, step by step, and of a closed valve."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mvest.closure.model import ClosureModel, ClosureResult
@@ -39,6 +37,13 @@ def measure_steps(
 ) -> list[dict[str, float]]:
     """Measure every stored step of a closure.
 
+    Returns for each step: ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²),
+    the opening between the thick leaflets along the best annulus normal; ``coaptation`` (mm), the
+    height at mid-valve over which two leaflets are within the contact distance (NaN for more);
+    ``intersections``, pairs of intersecting triangles of the leaflets' faces; the largest ``chord
+    strain`` and ``chord force`` (N); ``smallest det F`` at the quadrature points; ``Newton
+    iterations``.
+
     Parameters
     ----------
     model : ClosureModel
@@ -48,15 +53,6 @@ def measure_steps(
         mm between midsurfaces up to which leaflets count as coapting.
     normals : ndarray, optional
         ``(n, 3)`` directions of the thickness at the observed vertices.
-
-    Returns
-    -------
-    list of dict
-        For each step: ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening between the
-        thick leaflets along the best annulus normal; ``coaptation`` (mm), the height at mid-valve
-        over which two leaflets are within the contact distance (NaN for more); ``intersections``,
-        pairs of intersecting triangles of the leaflets' faces; the largest ``chord strain`` and
-        ``chord force`` (N); ``smallest det F`` at the quadrature points; ``Newton iterations``.
     """
     valve, system, simulation = model.valve, result.system, result.simulation
     surface, mesh = valve.surface, model.mesh

@@ -1,7 +1,5 @@
 """Predicts one scenario at the estimate and at samples of its posterior."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,6 +19,8 @@ def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
     Uses a scrambled Sobol sequence (Owen 1998, J. Complexity 14:466), transformed to the normal
     distribution in filter coordinates.
 
+    InputError if the estimate has not converged or the count is not a power of two.
+
     Parameters
     ----------
     estimate : Estimate
@@ -28,11 +28,6 @@ def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
     count : int
         A power of two balances the sequence.
     seed : int
-
-    Raises
-    ------
-    InputError
-        If the estimate has not converged or the count is not a power of two.
     """
     if not estimate.converged:
         raise InputError(f"no samples: the estimate has not converged: {estimate.reason.value}")
@@ -77,12 +72,9 @@ class PredictedScenario:
     def spread(self, name: str) -> dict[str, float]:
         """Statistics of a measure over the samples that did not fail.
 
-        Returns
-        -------
-        dict
-            ``mean`` and ``std``; ``low`` and ``high``, the 2.5 and 97.5 % quantiles (Hyndman and
-            Fan 1996, Am. Stat. 50:361, type 8), close to the extremes with fewer than 40 samples;
-            and the number of finite ``samples``. NaN if these are too few.
+        Returns a dict: ``mean`` and ``std``; ``low`` and ``high``, the 2.5 and 97.5 % quantiles
+        (Hyndman and Fan 1996, Am. Stat. 50:361, type 8), close to the extremes with fewer than 40
+        samples; and the number of finite ``samples``. NaN if these are too few.
         """
         known = np.array([v for v in (one.get(name) for one in self.samples) if np.isfinite(v)])
         mean = float(known.mean()) if len(known) else float("nan")
@@ -120,17 +112,11 @@ class PredictedScenario:
     def against(self, own: Sample, same: Sample) -> dict[str, dict[str, float | bool | None]]:
         """Compare every measure with that of the true valve.
 
-        Parameters
-        ----------
-        own, same : Sample
-            The true parameters' valve on its own mesh, and on the estimator's mesh, where only the
-            parameters are uncertain.
+        Returns a dict: measure -> its ``estimate``, `spread`, ``mesh_error``, the ``wide_``
+        `interval` with it, both truths, and whether the intervals contain them; None if unknown.
 
-        Returns
-        -------
-        dict
-            Measure -> its ``estimate``, `spread`, ``mesh_error``, the ``wide_`` `interval` with it,
-            both truths, and whether the intervals contain them; None if unknown.
+        ``own, same``: the true parameters' valve on its own mesh, and on the estimator's mesh,
+        where only the parameters are uncertain.
         """
 
         def inside(interval: tuple[float, float], true: float | None) -> bool | None:
@@ -183,6 +169,8 @@ def predict_scenario(
 ) -> PredictedScenario:
     """Predict a valve under a scenario, with the uncertainty of its estimate.
 
+    InputError if estimate and model do not have the same parameters.
+
     Parameters
     ----------
     model : ClosureModel
@@ -195,11 +183,6 @@ def predict_scenario(
         Called with the number of each finished sample, to show progress.
     finer : ClosureModel, optional
         The same model on a finer mesh, closed once at the estimate, for the mesh error.
-
-    Raises
-    ------
-    InputError
-        If estimate and model do not have the same parameters.
     """
     if estimate.names != model.names:
         raise InputError(

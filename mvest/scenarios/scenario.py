@@ -3,8 +3,6 @@
 Scenarios are simulated; none of them is a recommendation.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,10 +79,7 @@ class Scenario:
 def model_under(model: ClosureModel, scenario: Scenario) -> ClosureModel:
     """A fresh model of the same valve under a scenario; its guides change too.
 
-    Raises
-    ------
-    GeometryError
-        If the scenario does not fit the valve.
+    GeometryError if the scenario does not fit the valve.
     """
     changed = model.fresh()
     if changed.guide is not None:
@@ -153,11 +148,8 @@ def clip_points(valve: Valve, clip: Clip) -> tuple[FloatArray, FloatArray]:
     Two rows on each leaflet, at half and at full grasp from its free edge, in planes perpendicular
     to the commissural direction.
 
-    Raises
-    ------
-    GeometryError
-        If the free edges do not face each other at the clip, or it grasps more leaflet than there
-        is.
+    GeometryError if the free edges do not face each other at the clip, or it grasps more leaflet
+    than there is.
     """
     surface = valve.surface
     if len(surface.region_names) != 2:

@@ -5,8 +5,6 @@ No reader or writer of this project takes part in the exports: VTK (through PyVi
 surfaces, pandas tables, nibabel label maps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

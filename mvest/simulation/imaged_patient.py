@@ -7,8 +7,6 @@ from a coarse mesh, as for a population. Nothing is displaced: leaflets, annulus
 same images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

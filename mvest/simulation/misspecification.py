@@ -6,8 +6,6 @@ random stream separate from the patient's. So a seed gives the same valve with t
 all of them, apart from what the misspecification adds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 

@@ -8,8 +8,6 @@ papillary tips return part of their way, each in equilibrium. Motions that no va
 refused, so that no detector learns from them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -205,6 +203,8 @@ def closing_frames(
 
     Pressure and ramp are those of the mechanics' protocol, the steps those of ``settings``.
 
+    RefusedError if the valve does not close.
+
     Returns
     -------
     vertices : list of (n, 3) mm
@@ -212,11 +212,6 @@ def closing_frames(
     tips : list of (2, 3) mm
     model : ClosureModel
         It has been closed with the values of the valve.
-
-    Raises
-    ------
-    RefusedError
-        The valve does not close.
     """
     mesh = structured_mesh(
         drawn.template, settings.element, settings.mesh_columns, settings.mesh_rows

@@ -6,8 +6,6 @@ processes or on how often another valve was drawn again.
 A population is stored in one ``.npz`` file without pickled objects.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Trials of detectors on simulated volumes of valves that are not in the training."""
 
-from __future__ import annotations
-
 import json
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -113,14 +111,11 @@ def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str
 
     The detected valve counts however low its confidence is.
 
-    Returns
-    -------
-    dict
-        ``row``: JSON text like that of `try_volume`, with means of the absolute errors over the
-        frames; ``confidence`` is that of the best frame. ``errors`` (2, n, 3) and ``tip_errors``
-        (2, 2, 3), detected minus true in the valve's own axes, mm, in the open and the closed
-        frame. ``shapes`` and ``tip_shapes``: the detected valve in its detected axes. ``rest``
-        (n, 3): the true open vertices.
+    Returns a dict: ``row``: JSON text like that of `try_volume`, with means of the absolute errors
+    over the frames; ``confidence`` is that of the best frame. ``errors`` (2, n, 3) and
+    ``tip_errors`` (2, 2, 3), detected minus true in the valve's own axes, mm, in the open and the
+    closed frame. ``shapes`` and ``tip_shapes``: the detected valve in its detected axes. ``rest``
+    (n, 3): the true open vertices.
     """
     draw, scan = trial.random.spawn(2)
     rng = np.random.default_rng(draw)

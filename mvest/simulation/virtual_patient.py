@@ -5,8 +5,6 @@ errors differ from what its case states. The true values are returned separately
 Nothing here knows how a case is estimated, so that a stored patient does not depend on it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar

@@ -140,7 +140,7 @@ CASES = {
     "unused vertex": (
         surface(lambda x, t, r: (np.vstack([x, x[:1]]), t, r)), OPEN, r"vertices \[192\]"
     ),
-    "metres": (scaled(0.001), OPEN, r"0\.0359 mm across.*units.length.*would fit m "),
+    "metres": (scaled(0.001), OPEN, r"0\.036 mm across.*units.length.*would fit m "),
     "no labels": (surface(lambda x, t, r: (x, t, None)), OPEN, "labels; expected cell data"),
     "another region": (
         surface(lambda x, t, r: (x, t, 1 - r), "closed"), CLOSED, "belong to another region than in"

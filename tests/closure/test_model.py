@@ -36,7 +36,7 @@ GENTLE = ClosureProtocol(pressure_mmHg=0.5, ramp=0.1, dt=0.05, end=0.1)
 EXACT = NewtonSettings(tolerance=1e-13, smallest_move=1e-11, max_iterations=60)
 
 TEMPLATE = Template()
-SMALL = {"cells": (10, 2), "samples": (32, 8)}
+SMALL = {"cells": (12, 2), "samples": (32, 8)}
 TINY = {"cells": (8, 1), "samples": (16, 5)}
 
 
@@ -118,7 +118,7 @@ def test_the_closed_state_does_not_depend_on_how_the_path_to_it_is_solved(closed
 
 def test_a_guided_closure_ends_in_the_state_of_one_from_the_open_valve(closed):
     model, simulation = closed
-    coarse = model_of(CLOSING, cells=(10, 2))
+    coarse = model_of(CLOSING, cells=(14, 2))
     guided = replace(model, continuation=False, guide=coarse)
     result = guided.close(AT).simulation
     assert result.converged
@@ -178,7 +178,9 @@ def test_a_continuation_that_fails_is_repeated_from_the_open_valve(monkeypatch):
     np.testing.assert_array_equal(starts[0], first.frames[-1])
     assert starts[1] is None
     assert again.converged
-    np.testing.assert_allclose(again.frames, first.frames, rtol=0, atol=1e-9)
+    # Frames on the way are solved to the path tolerance only.
+    assert len(again.times) == len(first.times) > 2
+    np.testing.assert_allclose(again.frames[-1], first.frames[-1], rtol=0, atol=1e-9)
     # Unless it is not to be repeated: then the failure is the result.
     starts.clear()
     alone = replace(model, repeat=False)

@@ -115,7 +115,7 @@ def test_factors_of_all_chordae_and_of_some_multiply():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("chord_stiffness.strut", "known here: .*marginal.*tip0"),
+        ("chord_stiffness.secondary", "known here: .*marginal.*strut.*tip0"),
         ("field.anterior.4", "known here: anterior.0, .*anterior.3"),
         ("viscosity", "unknown parameter 'viscosity'"),
     ],

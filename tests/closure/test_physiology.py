@@ -17,6 +17,7 @@ from mvest.closure.physiology import (
     resistance_rows,
 )
 from mvest.closure.stress import peak_stress
+from mvest.mechanics.forces.trees import SUPPORT
 from mvest.mechanics.resistance import WAYS
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.valve.anatomy.template import Template
@@ -62,7 +63,13 @@ def test_tips_and_annulus_carry_the_pressure(closed, found):
         push += loads.pressure * own.sum(axis=0)
     ring = system.hinge.forces(x, loads.hinge).sum(axis=0)
     pull = chord_loads(system, x, loads).at_tip
-    np.testing.assert_allclose(pull.sum(axis=0) + ring, push, atol=1e-6)
+    # The springs that hold the junctions of slack trees bear the rest, below a millinewton.
+    cables, c = system.cables, len(system.cables.patches)
+    hung = loads.tips[cables.tip[c:]] + cables.place
+    junctions = cables.state(x, loads.tips, *system.factors.chordae).end[c:]
+    springs = SUPPORT * (junctions - hung).sum(axis=0)
+    assert np.linalg.norm(springs) < 1e-3
+    np.testing.assert_allclose(pull.sum(axis=0) + springs + ring, push, atol=1e-9)
     for k, own in enumerate(pull):
         assert found["force on a papillary tip", f"tip {k + 1}"]["value"] == np.linalg.norm(own)
 
@@ -77,8 +84,11 @@ def test_chordae_are_counted_by_family(closed, found):
         slack = (chords.force[own] == 0).sum()
         assert (value["chordae"], value["slack chordae"]) == (own.sum(), slack)
         assert value["largest chordal force"] == chords.force[own].max()
-        assert 0 < value["mean chordal force"] < value["largest chordal force"]
+        assert value["mean chordal force"] == chords.force[own].mean()
         assert value["largest chordal strain"] == 100 * chords.strain[own].max()
+    # Some marginal chordae are taut and some slack. On this coarse mesh the struts are slack.
+    force = chords.force[chordae.family == 0]
+    assert 0 < np.count_nonzero(force) < len(force)
 
 
 def test_strain_of_the_belly_excludes_what_touches(closed, found):
@@ -203,7 +213,7 @@ def test_shares_of_information_and_energy_add_up(closed):
 
 
 def test_tetrahedra_do_not_tell_bending_from_stretching(closed):
-    model = replace(closed[0].fresh(), mesh=structured_mesh(TEMPLATE, "tet10", 8, 1))
+    model = replace(closed[0].fresh(), mesh=structured_mesh(TEMPLATE, "tet10", 12, 2))
     assert resistance_rows(model, AT, model.mesh.nodes) == []
 
 

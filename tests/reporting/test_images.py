@@ -19,6 +19,7 @@ from mvest.reporting.images import (
     resample,
     valve_planes,
 )
+from mvest.valve.anatomy.dimensions import TemplateParameters
 from tests import made_up_sequence
 
 
@@ -85,12 +86,13 @@ def test_the_montage_has_frames_in_rows_and_draws_the_valve_on_them(valve, volum
     figure = montage_figure(volume, valve, title="made up", closed=0)
     assert "LOW CONFIDENCE" in panel(figure, 1, 0).get_ylabel()
     axes = panel(figure, 1, 1)
-    # The open anterior leaflet in the middle section begins at its annulus, half of 28 mm away
-    # but for the flattening, and hangs down by most of its length.
+    # The open anterior leaflet in the middle section begins at its annulus, half of its
+    # anteroposterior diameter away, and hangs down by most of its length.
     lines = [c for c in axes.collections if isinstance(c, LineCollection)]
     assert [line.get_label() for line in lines] == ["anterior leaflet", "posterior leaflet"]
     places = np.concatenate(lines[0].get_segments())
-    assert places[:, 0].max() == pytest.approx(0.5 * (2 - 0.08) * 14, abs=0.3)
+    diameter = TemplateParameters().annulus.anteroposterior_diameter
+    assert places[:, 0].max() == pytest.approx(0.5 * diameter, abs=0.3)
     assert np.ptp(places[:, 1]) > 20
 
 

@@ -202,7 +202,7 @@ def test_what_is_drawn_spreads_as_requested(closings):
         # Open tips are nearer to where their chordae insert.
         chordae, closed = valve.template.chordae(), valve.template.papillary_tips
         for k in range(2):
-            towards = (chordae.insertion[chordae.tip == k] - closed[k]).mean(axis=0)
+            towards = (chordae.insertion[chordae.end_tip == k] - closed[k]).mean(axis=0)
             assert valve.tip_motion[k] @ towards > 0
 
 

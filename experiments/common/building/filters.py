@@ -1,7 +1,5 @@
 """The configured filter, its coordinates, its prior and the noise that it assumes."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from importlib import import_module
 from typing import Any

@@ -244,7 +244,9 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str]) -> None:
             triangles = valve.triangles[valve.region == region]
             cut, _ = plane_section(shapes[k], triangles, np.zeros(3), np.array([1.0, 0.0, 0.0]))
             colour = colours[np.argmax(valve.region == region), 0]
-            column[2].add_collection(LineCollection(cut[..., 1:], colors=[colour], linewidths=2))
+            column[2].add_collection(
+                LineCollection(list(cut[..., 1:]), colors=[colour], linewidths=2)
+            )
         column[2].set_axis_off()
         for view, axes in zip((ATRIUM, posterior), column[:2], strict=True):
             shown = view is posterior

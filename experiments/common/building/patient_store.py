@@ -1,7 +1,5 @@
 """Virtual patients on disk: simulated once, with the case and its truth in separate folders."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

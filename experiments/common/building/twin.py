@@ -1,7 +1,5 @@
 """A synthetic study: the estimator's model and, separate from it, the observation's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial

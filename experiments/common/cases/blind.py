@@ -5,8 +5,6 @@ case, and refuses to open, list or rename anything within the sealed folder. Pyt
 cannot be removed (PEP 578). They do not see what compiled libraries or child programs open.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource

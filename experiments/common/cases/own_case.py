@@ -1,7 +1,5 @@
 """A configured case, or the valve in a configured volume: settings, check and result."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 All are cached on disk under a key of their inputs and code, so an interrupted study continues.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field

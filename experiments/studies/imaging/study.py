@@ -154,6 +154,8 @@ def calibrated(
 ) -> tuple[DetectionAccuracy, list[str]]:
     """Errors in the calibration volumes with a detected valve, and the names of these valves.
 
+    InputError if fewer than two volumes have a detected valve.
+
     Parameters
     ----------
     seen : sequence
@@ -162,11 +164,6 @@ def calibrated(
         Lowest confidence of a detected valve.
     wrong_mm : float
         A detection with this mean point error is not the valve.
-
-    Raises
-    ------
-    InputError
-        If fewer than two volumes have a detected valve.
     """
     own = _detected(seen, CALIBRATION, min_confidence, wrong_mm)
     if len(own) < 2:

@@ -33,17 +33,14 @@ LEAFLETS = ("#2b6ca3", "#c8452f")
 def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Figure:
     """The closed valves seen from the atrium, generic above personalised, on one scale.
 
+    InputError if a patient's distances are missing.
+
     Parameters
     ----------
     fields : mapping
         Name of each patient -> its arrays.
     denied : sequence of str
         Names of patients with the verdict "no estimate", which the figure shows above them.
-
-    Raises
-    ------
-    InputError
-        If a patient's distances are missing.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize

@@ -1,7 +1,5 @@
 """The open and the closed frame of a sequence, and the case that they make."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -118,6 +116,9 @@ def case_of_sequence(
 
     Thickness and fibres vary over a leaflet as in the template, because images do not show them.
 
+    InputError or GeometryError if a surface is not a valve: the message names the frame and the
+    fault.
+
     Parameters
     ----------
     texts : mapping
@@ -126,11 +127,6 @@ def case_of_sequence(
         Of each leaflet next to the annulus; default: generic values.
     error_samples : ErrorSamples, optional
         In the frames of the case, in the order of time.
-
-    Raises
-    ------
-    InputError, GeometryError
-        A surface is not a valve: the message names the frame and the fault.
     """
     layout, reference = sequence.layout, sequence.vertices[frames.open]
     _check_frames(sequence, frames)

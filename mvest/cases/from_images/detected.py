@@ -1,7 +1,5 @@
 """From a volume over time to a case: the valve is detected, measured and written."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -215,19 +213,15 @@ def detect_in_volume(
 ) -> DetectedValve:
     """Detect the valve in a volume over time and make a case of it.
 
+    NoValveError if the volume shows no valve; the error holds the best candidate. MvestError if the
+    volume cannot be read, or the valve in it makes no case.
+
     Parameters
     ----------
     estimate : bool
         Whether the case will be estimated, so that a pressure is required.
     progress : callable, optional
         Called with the number of finished frames and the number of all frames.
-
-    Raises
-    ------
-    NoValveError
-        The volume shows no valve; the error holds the best candidate.
-    MvestError
-        The volume cannot be read, or the valve in it makes no case.
     """
     settings = settings or ImagedSettings()
     # Settings are checked before anything that takes long.

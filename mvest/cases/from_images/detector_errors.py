@@ -12,8 +12,6 @@ Valves and detectors are nearly symmetric about the middle of the leaflets. So t
 part of errors and shapes are regressed separately.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -162,6 +160,10 @@ def coverage(
 ) -> list[dict[str, float]]:
     """How well the stated errors hold for valves that are not among the samples.
 
+    Returns for each frame ``within_95`` (% of coordinates within 1.96 of the
+    stated deviations), ``rms`` and ``stated`` (mm, the actual and the stated root mean square). The
+    same with the suffix ``_handed_on`` after the expected error of such a shape is subtracted.
+
     Parameters
     ----------
     errors : (S, 2, n, 3) mm
@@ -170,13 +172,6 @@ def coverage(
         Detected leaflets, then tips, in the valve's axes.
     confidence : (S,)
         Of each volume.
-
-    Returns
-    -------
-    list of dict
-        For each frame ``within_95`` (% of coordinates within 1.96 of the stated deviations),
-        ``rms`` and ``stated`` (mm, the actual and the stated root mean square). The same with the
-        suffix ``_handed_on`` after the expected error of such a shape is subtracted.
     """
     n = layout.size
     factors = np.array([accuracy.factor(one) for one in confidence])[:, None, None, None]

@@ -1,7 +1,5 @@
 """Measures of a valve from images in every frame, and its files for ParaView and 3D Slicer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -42,19 +40,13 @@ def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
     plus the standard deviation of the distance of two points with the median ``std_mm`` (nothing if
     that was never measured).
 
-    Returns
-    -------
-    list of dict
-        The same names for each frame: ``frame`` (from 0), ``time_s``, ``confidence`` (0 to 1),
-        ``vertex_confidence_mean``, ``contact_distance_mm`` and those of
-        `mvest.valve.measure.clinical`. None stands for what cannot be measured: everything in a
-        frame without a valve (confidence 0) or with points that are not finite, and tenting,
-        prolapse and billowing of an open valve (`OPEN_SHARE`).
+    InputError if the thickness is not a positive number.
 
-    Raises
-    ------
-    InputError
-        The thickness is not a positive number.
+    Returns the same names for each frame: ``frame`` (from 0), ``time_s``,
+    ``confidence`` (0 to 1), ``vertex_confidence_mean``, ``contact_distance_mm`` and those of
+    `mvest.valve.measure.clinical`. None stands for what cannot be measured: everything in a frame
+    without a valve (confidence 0) or with points that are not finite, and tenting, prolapse and
+    billowing of an open valve (`OPEN_SHARE`).
     """
     if not (np.isfinite(thickness_mm) and thickness_mm > 0):
         raise InputError(f"thickness_mm = {thickness_mm}, expected a finite number > 0")

@@ -1,7 +1,5 @@
 """Ensemble Kalman filter and smoother: covariances of many runs of the model."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,19 +45,12 @@ class EnsembleFilter(Filter):
     Pham 2001, Mon. Weather Rev. 129:1194). For a linear model and N > p the square root is then
     exactly the Kalman filter; the perturbed form has its mean in one step, and its covariance up to
     the error of N draws. Members whose model fails are left out.
-
-    Attributes
-    ----------
-    members, steps : int
-        N and k.
-    kind : str
-        ``square_root`` or ``perturbed``.
-    seed : int
     """
 
+    #: N and k
     members: int = 30
     steps: int = 1
-    kind: str = "square_root"
+    kind: str = "square_root"  #: ``square_root`` or ``perturbed``
     seed: int = 1
 
     def __post_init__(self) -> None:

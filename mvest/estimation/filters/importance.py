@@ -1,7 +1,5 @@
 """Weighted draws from the posterior itself, whatever its form."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,21 +61,13 @@ class ImportanceFilter(Filter):
 
     A model without derivatives has P₀ for every Pᵢ, and needs a ``start`` that takes such a model,
     for example `UnscentedFilter`.
-
-    Attributes
-    ----------
-    runs, batch : int
-        Largest number of runs of the model, without those of `start`, and runs of each round.
-    effective : float
-        Sufficient number of effective draws.
-    start : Filter
-        Finds x₀ and P₀.
-    seed : int
     """
 
+    #: largest number of runs of the model, without those of `start`, and runs of each round
     runs: int = 320
     batch: int = 32
-    effective: float = 60.0
+    effective: float = 60.0  #: sufficient number of effective draws
+    #: finds x₀ and P₀
     start: Filter = field(default_factory=lambda: IteratedFilter(tolerance=0.01))
     seed: int = 1
 

@@ -1,7 +1,5 @@
 """The reduced-order unscented Kalman filter: p + 1 runs of the model instead of a Jacobian."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -141,6 +141,8 @@ def identifiability(
     V diag(s²) Vᵀ and the bound D V diag(s⁻²) Vᵀ D. A prior is one more observation (Van Trees'
     bound, to first order).
 
+    InputError if shapes disagree, or a value is not admissible.
+
     Parameters
     ----------
     H : (n, p) in units of the observation per unit of each parameter
@@ -150,11 +152,6 @@ def identifiability(
     prior : Gaussian, optional
         Positive definite.
     names : p names, optional
-
-    Raises
-    ------
-    InputError
-        If shapes disagree, or a value is not admissible.
     """
     H = np.asarray(H, dtype=np.float64)
     if H.ndim != 2 or H.size == 0:

@@ -10,8 +10,6 @@ keyword line begins with one star, a comment with two; options are ``NAME=VALUE`
 matter. The instance prefix of a name is ignored.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -57,10 +55,7 @@ class _Block:
 class Deck:
     """The content of a deck, with nodes and elements numbered from 0 in file order.
 
-    Raises
-    ------
-    InputError
-        The file is damaged or has unsupported content; the message names the line.
+    InputError if the file is damaged or has unsupported content; the message names the line.
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,13 +106,7 @@ class Deck:
         return np.array(sorted(held), dtype=np.int64)
 
     def members(self, kind: str, name: str) -> IntArray:
-        """Members of a set (NSET or ELSET), as numbers.
-
-        Raises
-        ------
-        InputError
-            There is no such set.
-        """
+        """Members of a set (NSET or ELSET), as numbers. InputError if there is no such set."""
         what = {"NSET": "node set", "ELSET": "element set"}[kind]
         members: IntArray = self._known(self.sets[kind], name, what)
         return members
@@ -127,10 +116,7 @@ class Deck:
 
         Between two points it is Abaqus' smooth step ``10 u^3 - 15 u^4 + 6 u^5``.
 
-        Raises
-        ------
-        InputError
-            There is no such amplitude.
+        InputError if there is no such amplitude.
         """
         at, values = self._known(self._amplitudes, amplitude, "amplitude")
         i = np.clip(np.searchsorted(at, times, side="right") - 1, 0, len(at) - 2)

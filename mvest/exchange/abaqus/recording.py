@@ -11,8 +11,6 @@ Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w),
 **tricuspid** valve (three leaflets, right heart). It is not part of this package.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -79,10 +77,7 @@ class Recording:
 def recording_files(folder: Path) -> list[Path]:
     """The deck of a folder, followed by its frames in order.
 
-    Raises
-    ------
-    InputError
-        The deck or a frame is missing.
+    InputError if the deck or a frame is missing.
     """
     deck = folder / f"{folder.name}.inp"
     if not deck.is_file():
@@ -104,10 +99,8 @@ def read_recording(
 
     Names are case-insensitive and may include their instance.
 
-    Raises
-    ------
-    InputError
-        Files are missing or damaged, or the deck has unsupported content or contradicts the frames.
+    InputError if files are missing or damaged, or the deck has unsupported content or contradicts
+    the frames.
     """
     path, *files = recording_files(folder)
     with refusing(path, "input deck"):
@@ -192,6 +185,9 @@ def trace_cables(
 
     Unlike branches of one trunk, the cables do not restrain each other sideways.
 
+    InputError or GeometryError if a segment has no length or reaches no anchor, or an anchor
+    reaches no leaflet.
+
     Parameters
     ----------
     nodes : (n, 3) mm
@@ -205,11 +201,6 @@ def trace_cables(
     anchor, insertion, length, share : (c,)
         End nodes of each cable; length along the network (mm); axial stiffness of the cable
         relative to that of the chord material, in (0, 1].
-
-    Raises
-    ------
-    InputError, GeometryError
-        A segment has no length or reaches no anchor, or an anchor reaches no leaflet.
     """
     length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     if np.any(length <= 0):

@@ -1,7 +1,5 @@
 """Exports a case as FEBio input (file format 4)."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -99,10 +97,8 @@ def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
     Run it with ``febio4 -i TARGET``. FEBio writes the positions of all nodes at every step to
     ``TARGET_positions.csv``, and everything else to its plot file.
 
-    Raises
-    ------
-    InputError, GeometryError, MaterialError
-        The source is not a case, or FEBio has no counterpart for the valve.
+    InputError, GeometryError or MaterialError if the source is not a case, or FEBio has no
+    counterpart for the valve.
     """
     if target.suffix.lower() != ".feb":
         raise InputError(f"{target}: expected a name that ends in .feb")
@@ -143,10 +139,8 @@ def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
 def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) -> FebDocument:
     """FEBio input for the closure of a valve at parameters ``m (p,)``.
 
-    Raises
-    ------
-    InputError, MaterialError
-        FEBio has no counterpart for the mesh, or a modulus is inadmissible.
+    InputError or MaterialError if FEBio has no counterpart for the mesh, or a modulus is
+    inadmissible.
     """
     values = {**model.fixed, **dict(zip(model.names, map(float, m), strict=True))}
     mechanics, protocol = model.settings, model.settings.protocol

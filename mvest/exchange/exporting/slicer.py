@@ -1,7 +1,5 @@
 """3D Slicer and ParaView: surfaces over time, and landmarks with the labels of SlicerHeart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +42,8 @@ def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:
     frame. A closure (``experiment=closure``) is written as ``closing``: thick leaflets at every
     stored time, with first principal stress and contact pressure.
 
+    InputError if the source is neither a case nor a run; the target exists or cannot be written.
+
     Parameters
     ----------
     source
@@ -51,11 +51,6 @@ def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:
     target
         A new folder.
     options
-
-    Raises
-    ------
-    InputError
-        The source is neither a case nor a run; the target exists or cannot be written.
     """
     if target.exists():
         raise InputError(f"{target}: exists; expected a new folder")

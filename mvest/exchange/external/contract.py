@@ -13,8 +13,6 @@ All files are text: JSON or comma-separated numbers. Each run has a folder::
 Anything else raises an error that names the file and the row.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os
@@ -76,10 +74,7 @@ def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -
 class Command:
     """How to start a program, and its time limit.
 
-    Raises
-    ------
-    ConfigurationError
-        The program does not exist, or the limit is not positive.
+    ConfigurationError if the program does not exist, or the limit is not positive.
     """
 
     #: the program and its arguments, not interpreted by a shell. ``{request}`` and ``{folder}`` are
@@ -196,10 +191,7 @@ class _Response(_Message):
 def write_request(folder: Path, request: RunRequest, points: FloatArray | None = None) -> None:
     """Write ``request.json`` and, if points ``(n, 3)`` mm are given, ``points.csv``.
 
-    Raises
-    ------
-    InputError
-        A file cannot be written.
+    InputError if a file cannot be written.
     """
     if points is not None:
         write_points(folder / POINTS, points)
@@ -216,10 +208,7 @@ def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | No
 
     Derivatives are written only if ``names`` of the parameters are given.
 
-    Raises
-    ------
-    InputError
-        A file cannot be written.
+    InputError if a file cannot be written.
     """
     if prediction.converged:
         write_points(folder / OBSERVATION, prediction.y.reshape(-1, 3))
@@ -233,10 +222,7 @@ def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | No
 def read_answer(folder: Path, request: RunRequest) -> Prediction:
     """Read the response of a run; without ``jacobian.csv`` it has no derivatives.
 
-    Raises
-    ------
-    InputError
-        A file is missing or damaged, or does not fit the request.
+    InputError if a file is missing or damaged, or does not fit the request.
     """
     data = read_mapping(folder / RESPONSE, MAX_JSON_SIZE, RESPONSE)
     answer = validated(_Response, data, RESPONSE)
@@ -251,10 +237,7 @@ def read_answer(folder: Path, request: RunRequest) -> Prediction:
 def read_points(file: Path, count: int | None = None) -> FloatArray:
     """Read positions ``(n, 3)`` mm from a table ``x,y,z``.
 
-    Raises
-    ------
-    InputError
-        The file is not such a table, or does not have ``count`` rows.
+    InputError if the file is not such a table, or does not have ``count`` rows.
     """
     return _read_table(file, COORDINATES, count)
 

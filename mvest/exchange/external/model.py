@@ -3,8 +3,6 @@
 All data pass through files. Without derivatives from the program, differences are used.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -51,10 +49,7 @@ class Differences:
     def neighbours(self, m: FloatArray) -> FloatArray:
         """Parameters ``(2 p, p)`` of the runs: upper neighbours of ``m``, then lower neighbours.
 
-        Raises
-        ------
-        InputError
-            A parameter is so small that its step vanishes.
+        InputError if a parameter is so small that its step vanishes.
         """
         step = self.relative_step * np.maximum(np.abs(m), self.floor)
         if len(bad := np.flatnonzero(m + step == m)):
@@ -72,6 +67,9 @@ class ProcessModel:
     This is an observation model for the filters: a failed run gives a failed prediction with a
     reason. Each run has its own folder below ``folder``. Converged runs are reused, so an
     interrupted study resumes where it stopped.
+
+    InputError or ConfigurationError if the folder cannot be created, or points, names and units are
+    inconsistent.
 
     Parameters
     ----------
@@ -93,11 +91,6 @@ class ProcessModel:
         run is not reused if any of their contents has changed.
     differences : Differences or None
         How to differentiate if the program does not; None requires it to.
-
-    Raises
-    ------
-    InputError, ConfigurationError
-        The folder cannot be created, or points, names and units are inconsistent.
     """
 
     command: Command

@@ -15,8 +15,6 @@ counterclockwise, corners of the upper face, midpoints of the lower, the upper a
 edges; for a brick also the midpoints of its sides, its lower and its upper face, and its centre.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
@@ -81,10 +79,7 @@ def febio_mesh(mesh: SolidMesh) -> SolidMesh:
 
     Elements with two layers of nodes get a third one halfway between them.
 
-    Raises
-    ------
-    InputError
-        FEBio has no such element.
+    InputError if FEBio has no such element.
     """
     kind = mesh.element_type
     if kind in NAMES:
@@ -297,10 +292,7 @@ class FebDocument:
     def write(self, path: Path, remark: str = "") -> Path:
         """Write the file with a remark at its head; FEBio will log to `positions_file`.
 
-        Raises
-        ------
-        InputError
-            The file cannot be written.
+        InputError if the file cannot be written.
         """
         self._log.set("file", positions_file(path).name)
         root = Xml.Element("febio_spec", version="4.0")

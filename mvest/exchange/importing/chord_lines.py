@@ -5,8 +5,6 @@ its branching point, branches from there (a fan at the free edge, radial ones on
 leaflet).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -51,10 +49,7 @@ def chordae_of_lines(segments: FloatArray, tips: FloatArray, free_edge: FloatArr
     basal. Each family is as stiff at the tips as that of the template, each of its leaflet ends has
     the same share, and a trunk is as stiff as its branches together.
 
-    Raises
-    ------
-    InputError
-        Chords begin elsewhere than at the tips, meet, or form a cycle.
+    InputError if chords begin elsewhere than at the tips, meet, or form a cycle.
     """
     points, pairs = _graph(segments)
     branches = np.isin(pairs[:, 1], pairs[:, 0])

@@ -71,10 +71,7 @@ class Leaflet:
     def of(cls, vertices: FloatArray, triangles: IntArray) -> Leaflet:
         """The largest piece of a surface, with merged vertices and closed holes.
 
-        Raises
-        ------
-        GeometryError
-            The piece is closed, not a manifold, or has a second long boundary.
+        GeometryError if the piece is closed, not a manifold, or has a second long boundary.
         """
         whole = merged(Surface(vertices, triangles))
         points, faces = whole.vertices, whole.triangles
@@ -129,10 +126,8 @@ class Leaflet:
 def united(segments: Sequence[Leaflet]) -> Leaflet:
     """One leaflet from its segments (scallops), joined where their boundaries run side by side.
 
-    Raises
-    ------
-    GeometryError
-        A segment is farther than `SEAM_MM` from all others, or touches one at a point only.
+    GeometryError if a segment is farther than `SEAM_MM` from all others, or touches one at a point
+    only.
     """
     whole, *rest = segments
     while rest:
@@ -174,10 +169,7 @@ def loop_length(curve: FloatArray) -> float:
 def commissures_on(contour: FloatArray, leaflets: Sequence[Leaflet]) -> FloatArray:
     """The two points ``(2, 3)`` of a contour at which the nearer leaflet changes.
 
-    Raises
-    ------
-    GeometryError
-        The nearer leaflet does not change exactly twice.
+    GeometryError if the nearer leaflet does not change exactly twice.
     """
     distance = [_nearest(contour, leaflet.curve)[0] for leaflet in leaflets]
     difference = distance[0] - distance[1]  # smoothed over a few mm
@@ -203,6 +195,9 @@ def joined(
 ) -> tuple[Surface, FloatArray, float]:
     """Join the anterior and posterior leaflets into a band that faces the ventricle.
 
+    GeometryError if the commissures are far from the leaflets, the surfaces are not leaflets, or
+    the band's coordinates fold over.
+
     Parameters
     ----------
     leaflets
@@ -220,12 +215,6 @@ def joined(
 
     Returns the surface with the regions 0 (anterior) and 1 (posterior), the seams, and the largest
     width (mm) of the strips of triangles.
-
-    Raises
-    ------
-    GeometryError
-        The commissures are far from the leaflets, the surfaces are not leaflets, or the band's
-        coordinates fold over.
     """
     for name, leaflet in zip(REGIONS, leaflets, strict=True):
         away = float(_nearest(commissures, leaflet.curve)[0].max())

@@ -1,7 +1,5 @@
 """Identifies the voxels or closed surfaces of each leaflet in a source."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -77,10 +75,8 @@ def tissue_of(
     leaflet, or of both (``leaflets``); by default terminology and names decide. ``scale`` is mm per
     unit of surfaces. Sentences about used and unused parts are appended to ``derived``.
 
-    Raises
-    ------
-    InputError, GeometryError
-        Leaflets are not recognised, files are inconsistent, or surfaces are defective.
+    InputError or GeometryError if leaflets are not recognised, files are inconsistent, or surfaces
+    are defective.
     """
     chosen = [_parts(content, frame) for content in contents]
     nameless: tuple[str, ...] = ()

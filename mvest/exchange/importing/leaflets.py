@@ -1,7 +1,5 @@
 """Imports thick segmented leaflets: label maps, or closed surfaces of one or both leaflets."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -125,19 +123,12 @@ class _Seen:
 def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     """Make a case from the leaflets of an open valve, or of an open and a closed valve.
 
-    Parameters
-    ----------
-    source : Path
-        Label map (NRRD, ``.seg.nrrd``, NIfTI, MetaImage; converted to LPS) or closed surfaces (STL,
-        PLY, OBJ, GLB, VTK). If the file name contains ``anterior``, the other leaflet is read from
-        the same name with ``posterior``, and vice versa.
-    options : LeafletsOptions
+    InputError or GeometryError if a required option is missing (the message names it); leaflets are
+    not recognised, have holes, are in pieces, not closed surfaces, apart, or without an orifice.
 
-    Raises
-    ------
-    InputError, GeometryError
-        A required option is missing (the message names it); leaflets are not recognised, have
-        holes, are in pieces, not closed surfaces, apart, or without an orifice.
+    ``source``: label map (NRRD, ``.seg.nrrd``, NIfTI, MetaImage; converted to LPS) or closed
+    surfaces (STL, PLY, OBJ, GLB, VTK). If the file name contains ``anterior``, the other leaflet is
+    read from the same name with ``posterior``, and vice versa.
     """
     derived: list[str] = []
     frames: list[FoundFrame] = []

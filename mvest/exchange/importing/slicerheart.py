@@ -1,7 +1,5 @@
 """Imports SlicerHeart exports: leaflets, annulus, landmarks and papillary muscles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,18 +96,12 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     An open phase becomes the reference and a closed phase the closed frame; another closed phase is
     held out. The leaflets are separate surfaces in the export; they are joined at the commissures.
 
-    Parameters
-    ----------
-    source
-        The folder of one scene, with ``*_atrial_*.vtk`` and, if exported,
-        ``AnnulusContourPoints.csv``, ``ValveLandmarkPoints.csv`` and ``*_landmarks.fcsv``;
-        papillary muscles are lists of points in files named ``PapillaryMarkup-...``.
-    options
+    InputError or GeometryError if a required option is missing (the message names it), or files are
+    damaged or contradictory.
 
-    Raises
-    ------
-    InputError, GeometryError
-        A required option is missing (the message names it), or files are damaged or contradictory.
+    ``source``: the folder of one scene, with ``*_atrial_*.vtk`` and, if exported,
+    ``AnnulusContourPoints.csv``, ``ValveLandmarkPoints.csv`` and ``*_landmarks.fcsv``; papillary
+    muscles are lists of points in files named ``PapillaryMarkup-...``.
     """
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; expected one that SlicerHeart wrote")
@@ -184,12 +176,7 @@ def _frames(
             leaflets, commissures, down = _placed(seen, tips, options.mirrored, notes)
             # Closed edges touch all along, so they are joined as far as the open ones.
             surface, seams, gap = joined(
-                leaflets,
-                commissures,
-                seen.contour,
-                down,
-                offset_mm=offset,
-                seams=seams,
+                leaflets, commissures, seen.contour, down, offset_mm=offset, seams=seams
             )
         shares = ", ".join(f"{100 * share:.0f}" for share in seams.ravel())
         notes.append(

@@ -116,11 +116,8 @@ def read_folder(
     ``scene`` selects one of several scenes; ``only`` is a word in file names that selects one of
     several surfaces of a leaflet.
 
-    Raises
-    ------
-    InputError, GeometryError
-        There are no mitral leaflets, several scenes, or several surfaces of one leaflet, or a file
-        is damaged.
+    InputError or GeometryError if there are no mitral leaflets, several scenes, or several surfaces
+    of one leaflet, or a file is damaged.
     """
     paths = sorted(islice(folder.rglob("*"), MAX_FILES + 1))
     if len(paths) > MAX_FILES:

@@ -3,8 +3,6 @@
 A case is written to a folder and read back with the usual checks.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,10 +31,7 @@ def check_options(
 ) -> None:
     """Check the lengths of list options and the limits of numbers.
 
-    Raises
-    ------
-    InputError
-        A list has the wrong length, or a number is not finite or beyond its limits.
+    InputError if a list has the wrong length, or a number is not finite or beyond its limits.
     """
     for name, count in counts.items():
         given = getattr(options, name)
@@ -89,10 +84,8 @@ def case_of_frames(
     The regions of the frames are 0 (anterior) and 1 (posterior). ``document`` has further fields of
     ``case.yaml``; without ``chordae`` they are laid out; ``mirrored`` accepts a mirrored valve.
 
-    Raises
-    ------
-    InputError, GeometryError
-        As `mvest.cases.folder.read_case`; or the valve is mirrored, or the frames are swapped.
+    InputError or GeometryError as `mvest.cases.folder.read_case`; or the valve is mirrored, or the
+    frames are swapped.
     """
     for one in frames:
         x, faces, region = one.surface.vertices, one.surface.triangles, one.surface.region

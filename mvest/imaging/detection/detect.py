@@ -1,7 +1,5 @@
 """The valve in one frame: its pose, then landmarks, rims and leaflets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

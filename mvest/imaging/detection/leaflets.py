@@ -5,8 +5,6 @@ The candidates of a rim are in the plane perpendicular to it. Leaflets are found
 of the midsurface along their normals. Rims are the annulus and the free edge.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

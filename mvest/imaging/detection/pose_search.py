@@ -9,8 +9,6 @@ Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008). The refinement is a casca
 from the features at a pose to its error.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ vertices are uncertain, with a penalty on acceleration; a truncated Fourier seri
 closure itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -56,6 +54,9 @@ def detect_valve(
 ) -> ValveSequence:
     """Find the valve in every frame of a volume.
 
+    NoValveError if no frame shows a valve with this confidence. The error holds the best candidate.
+    InputError if a frame holds no image.
+
     Parameters
     ----------
     volume : VolumeSequence
@@ -64,13 +65,6 @@ def detect_valve(
         The best frame must reach it.
     progress : callable, optional
         Called with the number of finished frames and the number of all frames.
-
-    Raises
-    ------
-    NoValveError
-        No frame shows a valve with this confidence. The error holds the best candidate.
-    InputError
-        A frame holds no image.
     """
     times = np.asarray(volume.times)
     frames = [standard_frame(volume, k) for k in range(len(times))]

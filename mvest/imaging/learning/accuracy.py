@@ -1,7 +1,5 @@
 """Errors of the detectors in held-out volumes, and their correlation length."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

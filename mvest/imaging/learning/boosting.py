@@ -5,8 +5,6 @@ trusts the text: a text that is cut off makes it print foreign memory and abort 
 the text becomes plain arrays, checked once, whose outputs are the same bit for bit.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ noise that grows with the distance from one side, and a threshold, none of which
 simulator. Kinds and amounts are a choice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated
@@ -158,11 +156,7 @@ def volume_samples(
 
 
 def train_stage(
-    name: str,
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    settings: TrainingSettings,
-    seed: int,
+    name: str, x: NDArray[np.float32], y: NDArray[np.float32], settings: TrainingSettings, seed: int
 ) -> Boosters:
     """Trees of a stage from samples ``x (P, F)`` and ``y (P, outputs)`` of all volumes."""
     boosting, seed = settings.boosting, seed + 1000 * STAGES.index(name)

@@ -4,8 +4,6 @@ Levels in dB are of amplitude, relative to the root mean square of fully develop
 echo strength of 0 dB, seen face on and without attenuation.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, replace
 from typing import Literal, TypeAlias, get_args

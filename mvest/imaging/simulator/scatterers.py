@@ -3,8 +3,6 @@
 Scatterers have the same material coordinates in all frames, so that speckle moves with the tissue.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeAlias
 

@@ -6,8 +6,6 @@ at the annulus and move with it. Shapes and sizes are drawn within the usual ran
 choice. Positions are mm in the valve's own axes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 Envelopes along beams become grey levels in a Cartesian volume.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Sequence

@@ -58,32 +58,19 @@ class CableState(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cables:
-    """All cables of a valve: the segments of `mvest.valve.anatomy.valve.Chordae`.
+    """All cables of a valve: the segments of `mvest.valve.anatomy.valve.Chordae`."""
 
-    Attributes
-    ----------
-    patches : Embedding
-        ``(c,)`` leaflet ends.
-    tip : ndarray
-        ``(k,)`` index of the tip at each segment's root.
-    rest_length, axial_stiffness : ndarray
-        ``(k,)`` mm and N.
-    toe_strain : float
-    families : mapping
-        Name -> ``(k,)`` bool, the segments that belong to it.
-    parent : ndarray
-        ``(k,)`` junction at which each segment starts, or -1; by default all start at tips.
-    place : ndarray
-        ``(j, 3)`` mm, from the tip to where a junction hangs while its tree is slack.
-    """
-
-    patches: Embedding
-    tip: IntArray
+    patches: Embedding  #: ``(c,)`` leaflet ends
+    tip: IntArray  #: ``(k,)`` index of the tip at each segment's root
+    #: ``(k,)`` mm and N
     rest_length: FloatArray
     axial_stiffness: FloatArray
     toe_strain: float
+    #: name -> ``(k,)`` bool, the segments that belong to it
     families: Mapping[str, BoolArray] = field(default_factory=dict)
+    #: ``(k,)`` junction at which each segment starts, or -1; by default all start at tips
     parent: IntArray | None = None
+    #: ``(j, 3)`` mm, from the tip to where a junction hangs while its tree is slack
     place: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     trees: Trees = field(init=False)
 
@@ -95,10 +82,7 @@ class Cables:
     def members(self, part: str) -> BoolArray:
         """Segments ``(k,)`` of a family or papillary tip (``tip0``, ...); all if ``part`` is empty.
 
-        Raises
-        ------
-        InputError
-            If there is no such part.
+        InputError if there is no such part.
         """
         if not part:
             return np.ones(len(self.rest_length), dtype=np.bool_)
@@ -237,22 +221,13 @@ class Hinge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TiedPoints:
-    """Pairs of tied material points, independent of the mesh.
+    """Pairs of tied material points, independent of the mesh."""
 
-    Attributes
-    ----------
-    first, second : ndarray
-        ``(k, 3)`` mm, in the reference frame.
-    length : float
-        mm, distance of each pair in the closed valve.
-    stiffness : float
-        N/mm of each pair.
-    """
-
+    #: ``(k, 3)`` mm, in the reference frame
     first: FloatArray
     second: FloatArray
-    length: float
-    stiffness: float
+    length: float  #: mm, distance of each pair in the closed valve
+    stiffness: float  #: N/mm of each pair
 
     def __post_init__(self) -> None:
         if self.first.shape != self.second.shape or self.first.shape[1:] != (3,):

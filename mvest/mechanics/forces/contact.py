@@ -34,8 +34,6 @@ quarters of its distance to the barrier, and the triangulated midsurface samples
 (:mod:`mvest.mechanics.forces.pair_search`).
 """
 
-from __future__ import annotations
-
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray

@@ -13,8 +13,6 @@ within the sheet are always too close for the proof. No time step is accepted if
 intersect: it is repeated with detection throughout.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import ipctk
@@ -35,53 +33,34 @@ EXPECTED = 72
 
 
 class Sheet(NamedTuple):
-    """The sampled midsurface as input of the kernels.
+    """The sampled midsurface as input of the kernels."""
 
-    Attributes
-    ----------
-    rest : (k, 3) mm
-        The points at rest.
-    areas, thickness : (k,) mm² and mm
-    host, by_host : (k,)
-        Host element of each point, and the points sorted by their hosts.
-    activation, distance : float
-        Activation and reference distance over the thickness.
-    pressure : float
-        MPa at the reference distance.
-    """
-
-    rest: FloatArray
+    rest: FloatArray  #: (k, 3) mm, the points at rest
+    #: (k,) mm² and mm
     areas: FloatArray
     thickness: FloatArray
+    #: (k,), host element of each point, and the points sorted by their hosts
     host: IntArray
     by_host: IntArray
+    #: activation and reference distance over the thickness
     activation: float
     distance: float
-    pressure: float
+    pressure: float  #: MPa at the reference distance
 
 
 class ContactPairs(NamedTuple):
-    """Candidate pairs sorted by their host elements.
+    """Candidate pairs sorted by their host elements."""
 
-    Attributes
-    ----------
-    first, second : (p,)
-        Points with ``host[first] <= host[second]``.
-    reach, reference : (p,) mm
-        Activation and reference distance.
-    start, hosts : (g + 1,) and (g, 2)
-        Start of each group of pairs with equal hosts, and these hosts.
-    positions : (k, 3) mm
-        Positions of the points at the search.
-    """
-
+    #: (p,), points with ``host[first] <= host[second]``
     first: NDArray[np.int32]
     second: NDArray[np.int32]
+    #: (p,) mm, activation and reference distance
     reach: FloatArray
     reference: FloatArray
+    #: (g + 1,) and (g, 2), start of each group of pairs with equal hosts, and these hosts
     start: IntArray
     hosts: IntArray
-    positions: FloatArray
+    positions: FloatArray  #: (k, 3) mm, positions of the points at the search
 
 
 def search_pairs(y: FloatArray, sheet: Sheet, skin: float) -> ContactPairs:

@@ -6,8 +6,6 @@ The pressure acts on the current surface, against the outward normal: a face wit
 surface.
 """
 
-from __future__ import annotations
-
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray

@@ -4,8 +4,6 @@ A drawing is one collection in ordinary axes in millimetres. Leaflets therefore 
 them, and all panels can have the same scale.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 

@@ -95,11 +95,8 @@ def _views_figure(
 def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
     """The frames of a case as given, from two sides.
 
-    Parameters
-    ----------
-    case : ValveCase
-    reach_mm : float
-        Distance of midsurfaces within which leaflets touch. The closed frame shows its gap.
+    ``reach_mm``: distance of midsurfaces within which leaflets touch. The closed frame shows its
+    gap.
     """
     # Figures of a synthetic valve do not need what this imports.
     from mvest.cases.case import Role
@@ -144,17 +141,14 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
 
     A generic valve is drawn next to it on the same scale.
 
+    InputError if the personalised shape or its distances are missing.
+
     Parameters
     ----------
     fields : CaseFields or Path
         A path is read by `mvest.problem.fields.case_fields`.
     names : sequence of str
         Of the leaflets, written next to them.
-
-    Raises
-    ------
-    InputError
-        If the personalised shape or its distances are missing.
     """
     fields = case_fields(fields) if isinstance(fields, Path) else fields
     if fields.fitted is None or fields.distance_fitted is None:

@@ -4,8 +4,6 @@ The page opens from disk and loads nothing: pictures and the script of the turna
 embedded, and its content policy forbids every request. The template escapes all text.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io
@@ -57,6 +55,10 @@ def report(
 ) -> list[Path]:
     """Write ``unknowns.csv`` and, for an estimate, ``report.html`` with its figures.
 
+    InputError if arrays cannot be read or do not fit the record, or a file cannot be written.
+
+    Returns the files, ``unknowns.csv`` first.
+
     Parameters
     ----------
     result : Personalised or EstimateRecord
@@ -69,16 +71,6 @@ def report(
         Where the record came from, for the foot of each picture.
     provenance : mapping, optional
         The same in full, for the end of the page.
-
-    Returns
-    -------
-    list of Path
-        The files, ``unknowns.csv`` first.
-
-    Raises
-    ------
-    InputError
-        If arrays cannot be read or do not fit the record, or a file cannot be written.
     """
     folder = Path(folder)
     try:
@@ -203,10 +195,7 @@ def _only_row(record: EstimateRecord, name: str) -> Mapping[str, Any]:
 def _embedded(path: Path) -> dict[str, Any]:
     """A picture as a data address ``source``, with ``width`` and ``height`` in pixels.
 
-    Raises
-    ------
-    InputError
-        If the picture cannot be read.
+    InputError if the picture cannot be read.
     """
     try:
         with Image.open(path) as stored:

@@ -1,7 +1,5 @@
 """Tables of one estimate: unknowns, frames, and what its report lists besides."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """A turnable 3D view of the valve of one case: a plotly scene and its buttons."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any

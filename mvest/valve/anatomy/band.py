@@ -7,8 +7,6 @@ these take, and the first leaflet has the first section. Layered meshes, contact
 can therefore be laid out on any valve as on the template.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -34,6 +32,9 @@ Located = tuple[IntArray, FloatArray]
 class Band:
     """Material coordinates of a valve.
 
+    GeometryError if the surface is no band, or the leaflets do not meet along as many lines from
+    annulus to free edge, each between two neighbours.
+
     Parameters
     ----------
     valve : Valve
@@ -46,12 +47,6 @@ class Band:
     sections : tuple of int
         The leaflet, an index into ``region_names``, of each section of phi; the first one is 0. The
         leaflets may be named in any order.
-
-    Raises
-    ------
-    GeometryError
-        If the surface is no band, or the leaflets do not meet along as many lines from annulus to
-        free edge, each between two neighbours.
     """
 
     def __init__(self, valve: Valve) -> None:

@@ -124,11 +124,8 @@ def lumped_areas_change(vertices: FloatArray, triangles: IntArray, moves: FloatA
 class LeafletSurface:
     """Midsurface of all leaflets in the reference (open) frame.
 
-    Raises
-    ------
-    InputError, GeometryError
-        Wrong shapes, values that are not finite, unknown regions, thickness that is not positive,
-        or fibres without direction.
+    InputError or GeometryError for wrong shapes, values that are not finite, unknown regions,
+    thickness that is not positive, or fibres without direction.
     """
 
     vertices: FloatArray  #: (n, 3) mm
@@ -180,11 +177,8 @@ class Chordae:
     The k = c + j segments form trees, each rooted at a papillary tip. Segment i < c ends at
     insertion i, segment c + i at junction i. Straight chordae have no junctions.
 
-    Raises
-    ------
-    InputError
-        Wrong shapes, values that are not finite or not positive, unknown families or parents, or
-        segments that form no trees.
+    InputError for wrong shapes, values that are not finite or not positive, unknown families or
+    parents, or segments that form no trees.
     """
 
     tip: IntArray  #: ``(k,)`` index of the papillary tip at the root
@@ -261,10 +255,8 @@ class Chordae:
         A junction moves with its tip and the mean of the leaflet ends beyond it, each weighted by
         the length of the chord on the other side.
 
-        Parameters
-        ----------
-        tips, ends : (t, 3) and (c, 3) mm
-            Displacements of the papillary tips and of the insertions.
+        ``tips, ends`` ``(t, 3) and (c, 3) mm``: displacements of the papillary tips and of the
+        insertions.
         """
         weights = leverage(self.parent, self.rest_length, len(self.insertion))
         held = (1 - weights.sum(axis=1, keepdims=True)) * tips[self.tip[len(self.insertion) :]]
@@ -392,6 +384,8 @@ def sampled_valve(
 ) -> Valve:
     """A valve on a grid of ``columns x rows`` vertices.
 
+    InputError if the numbers are too small or do not divide among the leaflets.
+
     Parameters
     ----------
     shape : MaterialSurface
@@ -401,11 +395,6 @@ def sampled_valve(
     attached : callable
         Angles ``(columns,)`` of the annulus' vertices -> papillary tips ``(t, 3)`` mm, chordae, and
         the motion of annulus and tips.
-
-    Raises
-    ------
-    InputError
-        If the numbers are too small or do not divide among the leaflets.
     """
     sections, leaflets = np.array(shape.sections), len(shape.sections)
     if columns < 8 or columns % leaflets or rows < 3:

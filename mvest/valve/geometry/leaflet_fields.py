@@ -6,8 +6,6 @@ to a distance from the annulus that does not change. So the leaflets of a closed
 wherever they meet farther from the annulus, or deeper than their thickness.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -88,34 +86,24 @@ class LeafletFields:
 
 
 class ThickLeaflets(NamedTuple):
-    """The closed surface of two leaflets, cut apart where they are in contact.
+    """The closed surface of two leaflets, cut apart where they are in contact."""
 
-    Attributes
-    ----------
-    vertices, triangles
-        ``(n, 3)`` mm from the first point of the grid, and ``(m, 3)``.
-    seams : (2,) mm
-        Length from the annulus down over which the leaflets are one piece, on the side of each tip.
-    grown_mm : float
-        Outward offset of all walls needed to close holes.
-    derived : tuple of str
-        Changes needed to get one closed surface.
-    """
-
+    #: ``(n, 3)`` mm from the first point of the grid, and ``(m, 3)``
     vertices: FloatArray
     triangles: IntArray
+    #: (2,) mm, length from the annulus down over which the leaflets are one piece, on the side of
+    #: each tip
     seams: FloatArray
-    grown_mm: float
-    derived: tuple[str, ...]
+    grown_mm: float  #: outward offset of all walls needed to close holes
+    derived: tuple[str, ...]  #: changes needed to get one closed surface
 
 
 def fields_of_masks(
-    masks: Sequence[BoolArray],
-    spacing: FloatArray,
-    blur: float,
-    step_mm: float = STEP_MM,
+    masks: Sequence[BoolArray], spacing: FloatArray, blur: float, step_mm: float = STEP_MM
 ) -> tuple[LeafletFields, FloatArray]:
     """Compute signed distances to sets of voxels.
+
+    GeometryError if a leaflet has no voxels, or the leaflets are too large for the grid.
 
     Parameters
     ----------
@@ -133,11 +121,6 @@ def fields_of_masks(
         On a finer grid around the leaflets.
     ndarray
         ``(3,)`` position of the grid's first point, in voxels.
-
-    Raises
-    ------
-    GeometryError
-        A leaflet has no voxels, or the leaflets are too large for the grid.
     """
     if not all(mask.any() for mask in masks):
         raise GeometryError("no voxel of a leaflet")
@@ -169,11 +152,7 @@ def fields_of_masks(
         return np.asarray(ndimage.gaussian_filter(fine, blur * voxel / step))
 
     fields = LeafletFields(
-        np.stack([distance(mask) for mask in masks]),
-        distance(both),
-        step,
-        blur * voxel,
-        voxel,
+        np.stack([distance(mask) for mask in masks]), distance(both), step, blur * voxel, voxel
     )
     return fields, low.astype(np.float64)
 
@@ -227,6 +206,9 @@ def thick_leaflets(
 ) -> ThickLeaflets:
     """Make the closed surface of both leaflets: joined at the commissures, cut apart in contact.
 
+    GeometryError if the leaflets do not meet, or the orifice is not their only hole at any of
+    `LEVELS`.
+
     Parameters
     ----------
     fields
@@ -235,11 +217,6 @@ def thick_leaflets(
     seams
         ``(2,)`` mm, `ThickLeaflets.seams` of the open valve. Without it, and with one label for
         both leaflets, the leaflets are one piece wherever they meet.
-
-    Raises
-    ------
-    GeometryError
-        The leaflets do not meet, or the orifice is not their only hole at any of `LEVELS`.
     """
     if len(fields.distance) == 1:
         meet, half = np.zeros(fields.union.shape, dtype=np.bool_), fields.union

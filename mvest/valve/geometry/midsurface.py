@@ -45,31 +45,18 @@ TIP_CONE = 60.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Midsurface:
-    """The midsurface of two leaflets.
+    """The midsurface of two leaflets."""
 
-    Attributes
-    ----------
-    vertices : (n, 3) mm
-        A grid: vertex ``j * columns + i`` is column i, row j. The first row is the annulus, the
-        last the free edge; the commissures are columns 0 and ``columns / 2``.
-    triangles : (m, 3)
-        Facing the ventricle.
-    region : (m,)
-        0 anterior, 1 posterior.
-    thickness : (n,) mm
-    annulus, free_edge : (columns,)
-        Vertices in loop order.
-    derived : tuple of str
-        Properties that were not given but derived from the shape.
-    """
-
+    #: (n, 3) mm, a grid: vertex ``j * columns + i`` is column i, row j. The first row is the
+    #: annulus, the last the free edge; the commissures are columns 0 and ``columns / 2``.
     vertices: FloatArray
-    triangles: IntArray
-    region: IntArray
-    thickness: FloatArray
+    triangles: IntArray  #: (m, 3), facing the ventricle
+    region: IntArray  #: (m,), 0 anterior, 1 posterior
+    thickness: FloatArray  #: (n,) mm
+    #: (columns,), vertices in loop order
     annulus: IntArray
     free_edge: IntArray
-    derived: tuple[str, ...]
+    derived: tuple[str, ...]  #: properties that were not given but derived from the shape
 
     @property
     def commissures(self) -> IntArray:
@@ -118,6 +105,8 @@ def midsurface(
 ) -> Midsurface:
     """Compute the midsurface of two thick leaflets around one orifice.
 
+    GeometryError if the surface is not a closed thin band, or the leaflets cannot be distinguished.
+
     Parameters
     ----------
     vertices, triangles
@@ -134,11 +123,6 @@ def midsurface(
         Returns the leaflet (0 anterior, 1 posterior) of points ``(k, 3)``, if known.
     edge_mm
         Mean edge length of the triangles.
-
-    Raises
-    ------
-    GeometryError
-        The surface is not a closed thin band, or the leaflets cannot be distinguished.
     """
     first, second = walls(*closed_band(vertices, triangles))
     derived: list[str] = []

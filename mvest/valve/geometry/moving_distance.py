@@ -5,8 +5,6 @@ Smoothing over a width removes both problems, so that a filter that uses the der
 to its true posterior.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree

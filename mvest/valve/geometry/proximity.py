@@ -5,8 +5,6 @@ Everything here is exact geometry on plain arrays: vertices ``(n, 3)`` in mm and
 Collision Detection* (2005), section 5.1.5 (Voronoi regions of the triangle's features).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import chain
 
@@ -133,16 +131,13 @@ def closest_points(points: FloatArray, vertices: FloatArray, triangles: IntArray
     largest distance ``R`` from a centroid to its corners, the centroid of the closest triangle lies
     within ``d + R``.
 
+    GeometryError if the surface has no triangles.
+
     Parameters
     ----------
     points : (n, 3) mm
     vertices, triangles
         The surface, ``(n_vertices, 3)`` mm and ``(m, 3)``.
-
-    Raises
-    ------
-    GeometryError
-        The surface has no triangles.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     vertices = np.ascontiguousarray(vertices, dtype=np.float64)

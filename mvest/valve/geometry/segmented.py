@@ -1,7 +1,5 @@
 """From segmented leaflets and papillary muscles to the midsurface, its error, and the tips."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -46,6 +44,8 @@ def masks_midsurface(
 ) -> tuple[Midsurface, FloatArray]:
     """Compute the midsurface of labelled voxels, and the lengths ``(2,)`` mm of the seams.
 
+    GeometryError as raised by the functions named below.
+
     Parameters
     ----------
     masks
@@ -57,11 +57,6 @@ def masks_midsurface(
         See `thick_leaflets` and `fields_of_masks`.
     known
         See `mvest.valve.geometry.midsurface.midsurface`.
-
-    Raises
-    ------
-    GeometryError
-        As raised by those functions.
     """
     spacing, direction, origin = grid
     step = STEP_MM if seams is None else CLOSED_STEP_MM
@@ -93,6 +88,8 @@ def without_crossings(
 ) -> tuple[Midsurface, str]:
     """Smooth the surface around the valve, and smooth it further if it intersects itself.
 
+    GeometryError if the surface intersects itself at every level of smoothing.
+
     Parameters
     ----------
     surface
@@ -106,11 +103,6 @@ def without_crossings(
     Midsurface
     str
         Description of the smoothing; empty if there was none.
-
-    Raises
-    ------
-    GeometryError
-        The surface intersects itself at every level of smoothing.
     """
     faults = []
     for further in REPAIRS_MM:
@@ -147,17 +139,14 @@ def segmentation_std(voxel_mm: float, blur_mm: float, observer_mm: float) -> flo
 def papillary_tip(muscle: FloatArray, leaflets: FloatArray) -> FloatArray:
     """Centre ``(3,)`` mm of a muscle's head: its last `HEAD_MM` along the long axis.
 
+    GeometryError if the muscle is not slender (`MIN_SLENDER`).
+
     Parameters
     ----------
     muscle
         ``(n, 3)`` mm, points of the muscle.
     leaflets
         ``(m, 3)`` mm; the head is the end nearer to their centre.
-
-    Raises
-    ------
-    GeometryError
-        The muscle is not slender (`MIN_SLENDER`).
     """
     middle = muscle.mean(axis=0)
     _, _, axes = np.linalg.svd(muscle - middle, full_matrices=False)
@@ -175,16 +164,9 @@ def papillary_tip(muscle: FloatArray, leaflets: FloatArray) -> FloatArray:
 def check_tips_of(surface: Midsurface, tips: FloatArray) -> None:
     """Raise an error if tips and leaflets seem to use different axes.
 
-    Parameters
-    ----------
-    surface
-    tips
-        ``(2, 3)`` mm, LPS, antero-lateral tip first.
+    GeometryError if a tip is farther than `MAX_AWAY` from the leaflets.
 
-    Raises
-    ------
-    GeometryError
-        A tip is farther than `MAX_AWAY` from the leaflets.
+    ``tips``: ``(2, 3)`` mm, LPS, antero-lateral tip first.
     """
     centre = surface.vertices.mean(axis=0)
     away, turned = (

@@ -3,8 +3,6 @@
 Each fault raises a `GeometryError` that names the fault and the triangles, edges or vertices.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
@@ -40,6 +38,10 @@ def check_surface(
 ) -> None:
     """Raise unless a triangulation is a valid, oriented manifold surface.
 
+    GeometryError for the first of these faults: wrong shape, not finite, no triangles, index out of
+    range, degenerate triangle, duplicate triangle, non-manifold edge, inconsistent orientation,
+    non-manifold vertex, open surface, inward normals, self-intersection.
+
     Parameters
     ----------
     vertices : (n, 3) mm
@@ -51,13 +53,6 @@ def check_surface(
         Also require that no triangle passes through another.
     name
         Name of the surface in the message.
-
-    Raises
-    ------
-    GeometryError
-        The first of these faults: wrong shape, not finite, no triangles, index out of range,
-        degenerate triangle, duplicate triangle, non-manifold edge, inconsistent orientation,
-        non-manifold vertex, open surface, inward normals, self-intersection.
     """
     points = np.asarray(vertices, dtype=np.float64)
     faces = np.asarray(triangles)

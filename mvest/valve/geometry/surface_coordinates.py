@@ -16,8 +16,6 @@ negative weights around folded triangles are raised until no fold is left. The c
 harmonic except at those few edges.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 
@@ -42,24 +40,15 @@ OUTSIDE = 0.01
 
 @dataclass(frozen=True, slots=True)
 class SurfaceCoordinates:
-    """Harmonic coordinates of a band and their circumferential direction.
+    """Harmonic coordinates of a band and their circumferential direction."""
 
-    Attributes
-    ----------
-    triangles : ndarray
-        ``(m, 3)`` vertex indices.
-    theta, s : (n,)
-        Angle around the valve in [0, 2 pi), and 0 (annulus) to 1 (free edge).
-    modulus : float
-        Length of the strip for a width of 2 pi: ``(theta, modulus * s)`` is nearly conformal.
-    circumferential : ndarray
-        ``(n, 3)`` unit tangents parallel to the annulus (perpendicular to the gradient of ``s``).
-    """
-
-    triangles: IntArray
+    triangles: IntArray  #: ``(m, 3)`` vertex indices
+    #: (n,), angle around the valve in [0, 2 pi), and 0 (annulus) to 1 (free edge)
     theta: FloatArray
     s: FloatArray
+    #: length of the strip for a width of 2 pi: ``(theta, modulus * s)`` is nearly conformal
     modulus: float
+    #: ``(n, 3)`` unit tangents parallel to the annulus (perpendicular to the gradient of ``s``)
     circumferential: FloatArray
 
     def strip_triangles(self) -> FloatArray:
@@ -90,11 +79,8 @@ class SurfaceCoordinates:
 def boundary_loops(triangles: IntArray) -> list[IntArray]:
     """Boundary loops of a triangulation, each in the direction of its triangles.
 
-    Raises
-    ------
-    GeometryError
-        An edge has more than two triangles, neighbours differ in orientation, or a boundary vertex
-        has more than two boundary edges.
+    GeometryError if an edge has more than two triangles, neighbours differ in orientation, or a
+    boundary vertex has more than two boundary edges.
     """
     triangles = np.asarray(triangles)
     directed, edges, number, count = edge_table(triangles)
@@ -149,18 +135,15 @@ def surface_coordinates(
 ) -> SurfaceCoordinates:
     """Solve for ``theta`` and ``s`` on a band.
 
+    GeometryError if annulus and free edge are not the two boundary loops, a triangle has all
+    corners on one loop, or the coordinates fold over.
+
     Parameters
     ----------
     vertices : (n, 3) mm
     triangles : (m, 3)
     annulus, free_edge : ndarray
         Vertex indices of the two boundary loops, the annulus in loop order.
-
-    Raises
-    ------
-    GeometryError
-        Annulus and free edge are not the two boundary loops, a triangle has all corners on one
-        loop, or the coordinates fold over.
     """
     vertices = np.asarray(vertices, dtype=float)
     loops = boundary_loops(triangles)

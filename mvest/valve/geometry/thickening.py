@@ -1,7 +1,5 @@
 """Thickens a midsurface to the closed surface of its leaflets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,10 +28,7 @@ def smooth_vertex_normals(
     Each iteration averages a normal with the mean of its neighbours' normals, and normalises it.
     Thickening along raw normals would make triangles cross at sharp bends, such as the commissures.
 
-    Raises
-    ------
-    GeometryError
-        A vertex has no triangle, or opposite normals cancel.
+    GeometryError if a vertex has no triangle, or opposite normals cancel.
     """
     return smooth_normals_change(vertices, triangles, iterations, np.zeros((*vertices.shape, 0)))[0]
 
@@ -89,10 +84,7 @@ def _across(normals: FloatArray, change: FloatArray) -> FloatArray:
 class ClosedSurface:
     """Outer surface of thickened leaflets, with outward normals.
 
-    Raises
-    ------
-    GeometryError
-        The surface is not closed, manifold, outward and free of self-intersections.
+    GeometryError if the surface is not closed, manifold, outward and free of self-intersections.
     """
 
     vertices: FloatArray  #: (n, 3) mm
@@ -110,18 +102,15 @@ def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> Close
     Vertex ``i`` of the midsurface becomes the vertices ``i`` (ventricular side, along the normal)
     and ``i + n`` (atrial side). Every boundary edge gives two rim triangles.
 
+    GeometryError if the midsurface is invalid, or the thickened surface intersects itself (the
+    thickness exceeds the radius of curvature).
+
     Parameters
     ----------
     surface
         Midsurface with thickness; normals towards the ventricle.
     normals
         ``(n, 3)`` unit offset directions; default `smooth_vertex_normals`.
-
-    Raises
-    ------
-    GeometryError
-        The midsurface is invalid, or the thickened surface intersects itself (the thickness exceeds
-        the radius of curvature).
     """
     check_surface(surface.vertices, surface.triangles, name="midsurface")
     if normals is None:

@@ -10,8 +10,6 @@ the position over the surface at rest are averages over the triangles at both en
 The weights depend only on the surface at rest, so derivatives by the vertices are exact.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,10 +134,7 @@ class Refinement:
 
 
 def refined(
-    vertices: FloatArray,
-    triangles: IntArray,
-    edge_length: float,
-    loops: tuple[IntArray, ...] = (),
+    vertices: FloatArray, triangles: IntArray, edge_length: float, loops: tuple[IntArray, ...] = ()
 ) -> Refinement:
     """Halve the edges of a surface until their median length is small enough.
 

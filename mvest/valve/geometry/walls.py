@@ -8,8 +8,6 @@ the surface at a vertex gives the opposite point (shrinking balls: Ma, Bae and C
 Comput. 28:7).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,11 +50,8 @@ class Wall:
 def closed_band(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray]:
     """Check that a closed surface bounds one thick band, and turn its normals outwards.
 
-    Raises
-    ------
-    GeometryError
-        The surface is open, invalid or in several pieces, or has not exactly one hole (Euler number
-        0): there is no orifice, or leaflets that only touch are joined.
+    GeometryError if the surface is open, invalid or in several pieces, or has not exactly one hole
+    (Euler number 0): there is no orifice, or leaflets that only touch are joined.
     """
     vertices = np.asarray(vertices, dtype=np.float64)
     triangles = np.asarray(triangles, dtype=np.int64)
@@ -93,10 +88,7 @@ def closed_band(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, 
 def walls(vertices: FloatArray, triangles: IntArray) -> tuple[Wall, Wall]:
     """Split a closed surface from `closed_band` into its two walls.
 
-    Raises
-    ------
-    GeometryError
-        The parts are not two bands with common edges: the leaflets are not thin.
+    GeometryError if the parts are not two bands with common edges: the leaflets are not thin.
     """
     side = _sides(vertices, triangles)
     points, faces, upper = _parted(vertices, triangles, side)

@@ -1,7 +1,5 @@
 """The annulus: its plane, the three clinical directions, its size and its minimal surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,17 +12,11 @@ from mvest.typing import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class AnnulusPlane:
-    """Best plane through an annulus, with the three clinical directions.
+    """Best plane through an annulus, with the three clinical directions."""
 
-    Attributes
-    ----------
-    origin : (3,) mm
-        Centroid of the annulus curve, weighted by length.
-    normal, anterior, lateral : (3,) unit
-        From atrium to ventricle; in the plane from posterior to anterior; ``normal × anterior``.
-    """
-
-    origin: FloatArray
+    origin: FloatArray  #: (3,) mm, centroid of the annulus curve, weighted by length
+    #: (3,) unit, from atrium to ventricle; in the plane from posterior to anterior; ``normal ×
+    #: anterior``
     normal: FloatArray
     anterior: FloatArray
     lateral: FloatArray
@@ -59,6 +51,9 @@ def annulus_plane(
 ) -> AnnulusPlane:
     """Fit the annulus plane by least squares, each segment of the curve weighted by its length.
 
+    GeometryError for wrong shape, non-finite or collinear points, or a point that gives no
+    direction.
+
     Parameters
     ----------
     annulus
@@ -67,11 +62,6 @@ def annulus_plane(
         ``(3,)`` mm, any point on the ventricular side (the middle of the papillary tips).
     anterior_point
         ``(3,)`` mm, any point on the anterior side (the middle of the anterior annulus).
-
-    Raises
-    ------
-    GeometryError
-        Wrong shape, non-finite or collinear points, or a point that gives no direction.
     """
     loop = checked_loop(annulus)
     following = np.roll(loop, -1, axis=0)
@@ -148,6 +138,9 @@ def spanning_surface(annulus: FloatArray, plane: AnnulusPlane) -> tuple[FloatArr
     triangles (Johnson and Thomée 1975, Math. Comp. 29:343); the root is that of the iteration
     before. Over a convex outline this surface is unique (Radó 1930, Math. Z. 32:763).
 
+    GeometryError if it is no curve, or its projection on the plane is not star-shaped about its
+    centre.
+
     Parameters
     ----------
     annulus : (k, 3) mm
@@ -160,11 +153,6 @@ def spanning_surface(annulus: FloatArray, plane: AnnulusPlane) -> tuple[FloatArr
     vertices : (n, 3) mm
         The points of the curve first, in their order.
     triangles : (m, 3)
-
-    Raises
-    ------
-    GeometryError
-        No curve, or its projection on the plane is not star-shaped about its centre.
     """
     loop = plane.coordinates(checked_loop(annulus))
     k = len(loop)

@@ -19,8 +19,6 @@ annulus centre that holds its normal and the anterior direction.
   annulus points; ``tip_separation``: between the tips.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeAlias
 
@@ -96,6 +94,9 @@ def clinical_measurements(
     echocardiography (Grewal et al. 2010, Circulation 121:1423), its height over its width that of
     Salgo et al. 2002 (Circulation 106:711).
 
+    Returns a dict: name with unit -> number. Measurements that the shape does not admit are
+    missing; all are if the annulus has no plane.
+
     Parameters
     ----------
     vertices : (n, 3) mm
@@ -110,12 +111,6 @@ def clinical_measurements(
         mm between midsurfaces that count as touching.
     tip_names : sequence of str
         Names of the tips, such as ``tip_0``, to report each one as well as their mean.
-
-    Returns
-    -------
-    dict
-        Name with unit -> number. Measurements that the shape does not admit are missing; all are
-        if the annulus has no plane.
     """
     try:
         plane = plane_of_leaflets(vertices, surface, annulus, tips)

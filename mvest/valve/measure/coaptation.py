@@ -8,8 +8,6 @@ line of sight from the atrium counts as open only if it is farther from every le
 distance at which two of them touch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,12 +18,7 @@ from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.geometry.proximity import (
-    closest_on_triangle,
-    closest_points,
-    plane_section,
-    row,
-)
+from mvest.valve.geometry.proximity import closest_on_triangle, closest_points, plane_section, row
 from mvest.valve.geometry.triangles import areas, unit_normals
 from mvest.valve.measure.annulus import AnnulusPlane
 
@@ -34,32 +27,20 @@ MAX_PIXELS = 50_000_000
 
 @dataclass(frozen=True, slots=True)
 class LeafletProjection:
-    """Leaflets seen from the atrium along the annulus normal, as an image.
+    """Leaflets seen from the atrium along the annulus normal, as an image."""
 
-    Attributes
-    ----------
-    anterior, lateral : (rows,) and (columns,) mm
-        Pixel centres along those directions.
-    inside : (rows, columns)
-        Pixels inside the projected annulus.
-    depth : (rows, columns) mm
-        Depth of the first leaflet surface below the annulus plane, infinite if there is none.
-    """
-
+    #: (rows,) and (columns,) mm, pixel centres along those directions
     anterior: FloatArray
     lateral: FloatArray
-    inside: BoolArray
+    inside: BoolArray  #: (rows, columns), pixels inside the projected annulus
+    #: (rows, columns) mm, depth of the first leaflet surface below the annulus plane, infinite if
+    #: there is none
     depth: FloatArray
 
 
 @njit(cache=True)
 def _rasterise(
-    points: FloatArray,
-    triangles: IntArray,
-    x0: float,
-    y0: float,
-    step: float,
-    depth: FloatArray,
+    points: FloatArray, triangles: IntArray, x0: float, y0: float, step: float, depth: FloatArray
 ) -> None:
     """Set `depth` at all pixel centres to that of the first triangle that covers them."""
     rows, columns = depth.shape
@@ -110,6 +91,9 @@ def project_leaflets(
 ) -> LeafletProjection:
     """Rasterise the leaflets inside the annulus, seen along the annulus normal.
 
+    GeometryError if the pixel size is not positive or so small that the image has more than 50
+    million pixels.
+
     Parameters
     ----------
     vertices, triangles
@@ -120,11 +104,6 @@ def project_leaflets(
         Plane of that annulus; its normal is the line of sight.
     resolution
         Pixel size, mm.
-
-    Raises
-    ------
-    GeometryError
-        Pixel size not positive or so small that the image has more than 50 million pixels.
     """
     if not (np.isfinite(resolution) and resolution > 0):
         raise GeometryError(f"resolution = {resolution} mm; give a positive pixel size")
@@ -329,26 +308,18 @@ def _part_centroids(n: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gap:
-    """The gap of a closed valve as an image, seen from the atrium along the annulus normal.
+    """The gap of a closed valve as an image, seen from the atrium along the annulus normal."""
 
-    Attributes
-    ----------
-    anterior, lateral : (rows,) and (columns,) mm
-        Pixel centres along those directions of the annulus.
-    open, slit : (rows, columns)
-        Pixels of the gap, and other pixels within the annulus that no midsurface covers.
-    level : (rows, columns) mm
-        Depth of the nearest midsurface below the annulus plane.
-    resolution : float
-        mm.
-    """
-
+    #: (rows,) and (columns,) mm, pixel centres along those directions of the annulus
     anterior: FloatArray
     lateral: FloatArray
+    #: (rows, columns), pixels of the gap, and other pixels within the annulus that no midsurface
+    #: covers
     open: BoolArray
     slit: BoolArray
+    #: (rows, columns) mm, depth of the nearest midsurface below the annulus plane
     level: FloatArray
-    resolution: float
+    resolution: float  #: mm
 
     @property
     def area(self) -> float:
@@ -366,6 +337,8 @@ def find_gap(
 ) -> Gap:
     """Find the gap of a closed valve; a gap that an overlapping leaflet hides is not counted.
 
+    InputError or GeometryError if the reach is negative or the resolution gives too large an image.
+
     Parameters
     ----------
     vertices, triangles : ndarray
@@ -376,11 +349,6 @@ def find_gap(
         mm, largest distance of two midsurfaces that touch.
     resolution : float
         mm, size of a pixel.
-
-    Raises
-    ------
-    InputError, GeometryError
-        If the reach is negative or the resolution gives too large an image.
     """
     if not (np.isfinite(reach) and reach >= 0):
         raise InputError(f"reach of the contact = {reach} mm, expected >= 0")

@@ -1,7 +1,5 @@
 """Membrane strain of leaflets between two shapes of one surface, and quantiles by area."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

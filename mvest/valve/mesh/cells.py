@@ -4,8 +4,6 @@ A lattice has two steps along each axis of a cell, so that mid-edge nodes are la
 is one brick, two wedges or six tetrahedra.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mvest.elements import element
@@ -80,6 +78,8 @@ def box(
 ) -> tuple[FloatArray, IntArray]:
     """Nodes ``(n, 3)`` mm and elements ``(m, k)`` of the block ``[0, size]``.
 
+    InputError if the element is unknown, or a size or number of cells is not positive.
+
     Parameters
     ----------
     element_type : str
@@ -88,11 +88,6 @@ def box(
         Cells along x, y and z; z is the thickness.
     size : tuple of float
         mm.
-
-    Raises
-    ------
-    InputError
-        If the element is unknown, or a size or number of cells is not positive.
     """
     if min(cells) < 1 or not min(size) > 0:
         raise InputError(f"box of {cells} cells and size {size} mm, expected all > 0")
@@ -118,10 +113,7 @@ def local_faces(element_type: str) -> IntArray:
 def boundary(elements: IntArray, element_type: str) -> tuple[IntArray, IntArray]:
     """Faces of one element only: their elements ``(f,)`` and local numbers ``(f,)``.
 
-    Raises
-    ------
-    GeometryError
-        If a face belongs to more than two elements.
+    GeometryError if a face belongs to more than two elements.
     """
     local = local_faces(element_type)
     faces = np.sort(elements[:, local].reshape(-1, local.shape[1]), axis=1)

@@ -5,8 +5,6 @@ meshed with tetrahedra. That mesher keeps neither vertices nor labels, so these 
 nearness: regions and fibres from the midsurface, pressure faces from the closed surface.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -28,13 +26,7 @@ class GivenValve(Band):
     """An imported valve in any resolution, and its meshes in layers."""
 
     def layers(self, element: str, columns: int, rows: int, layers: int = 1) -> SolidMesh:
-        """A mesh of ``columns x rows x layers`` cells.
-
-        Raises
-        ------
-        GeometryError
-            If cells are folded.
-        """
+        """A mesh of ``columns x rows x layers`` cells. GeometryError if cells are folded."""
         try:
             return structured_mesh(self, element, columns, rows, layers)
         except GeometryError as fault:
@@ -62,6 +54,9 @@ def tetrahedral_leaflets(
     of the nearest midsurface point, projected on its tangent plane. Pressure faces are the outer
     faces nearest to ventricular triangles of the closed surface that face the same way.
 
+    InputError if the element type is neither ``tet4`` nor ``tet10``. MeshingError as
+    `tetrahedralize`, or the area of the pressure faces is not that of the ventricular side.
+
     Parameters
     ----------
     surface
@@ -72,13 +67,6 @@ def tetrahedral_leaflets(
         ``"tet10"`` or ``"tet4"``.
     normals
         Offset directions of `mvest.valve.geometry.thickening.thicken`.
-
-    Raises
-    ------
-    InputError
-        The element type is neither ``tet4`` nor ``tet10``.
-    MeshingError
-        As `tetrahedralize`, or the area of the pressure faces is not that of the ventricular side.
     """
     if element_type not in ("tet4", "tet10"):
         raise InputError(f"element_type {element_type!r}: pytetwild meshes are 'tet4' or 'tet10'")

@@ -11,8 +11,6 @@ normal, from the atrial (``zeta = -1``) to the ventricular face. Raw normals and
 could invert wedges at sharp bends, such as the commissures.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -25,11 +23,7 @@ from mvest.typing import IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.surface_coordinates import (
-    boundary_loops,
-    surface_coordinates,
-    wrapped,
-)
+from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates, wrapped
 from mvest.valve.geometry.triangles import edge_table, surface_edges, unit_rows
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
@@ -60,12 +54,8 @@ def remesh(
 
     The result has ``vertices`` vertices, or fewer if all fine ones off the loops are kept.
 
-    Raises
-    ------
-    InputError
-        If ``vertices`` is too small for the two loops or above the number of fine vertices.
-    GeometryError
-        If the surface is not a band, or the triangulation loses an edge of a loop.
+    InputError if ``vertices`` is too small for the two loops or above the number of fine vertices.
+    GeometryError if the surface is not a band, or the triangulation loses an edge of a loop.
     """
     x = surface.vertices
     if not 24 <= vertices <= len(x):
@@ -119,12 +109,12 @@ def remesh(
 
 
 def layered_wedges(
-    surface: LeafletSurface,
-    onto: LeafletSurface,
-    element_type: str = "wedge12",
-    layers: int = 1,
+    surface: LeafletSurface, onto: LeafletSurface, element_type: str = "wedge12", layers: int = 1
 ) -> SolidMesh:
     """Thicken a midsurface into layers of six-node-triangle wedges.
+
+    InputError for an unknown element or fewer than one layer. GeometryError if elements are
+    inverted: the surface bends within its thickness.
 
     Parameters
     ----------
@@ -136,13 +126,6 @@ def layered_wedges(
     element_type : {"wedge12", "wedge18"}
         Linear or quadratic through each layer.
     layers : int
-
-    Raises
-    ------
-    InputError
-        For an unknown element or fewer than one layer.
-    GeometryError
-        If elements are inverted: the surface bends within its thickness.
     """
     if element_type not in LEVELS_PER_LAYER or layers < 1:
         raise InputError(

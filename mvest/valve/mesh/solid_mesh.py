@@ -34,11 +34,8 @@ def jacobian_determinants(
 class SolidMesh:
     """A solid finite-element mesh of the leaflets.
 
-    Raises
-    ------
-    InputError, GeometryError
-        Wrong shapes, values that are not finite, unused nodes, fibres without direction, or
-        elements whose Jacobian determinant is not positive at a quadrature point.
+    InputError or GeometryError for wrong shapes, values that are not finite, unused nodes, fibres
+    without direction, or elements whose Jacobian determinant is not positive at a quadrature point.
     """
 
     nodes: FloatArray  #: (n, 3) mm
@@ -180,12 +177,8 @@ def embed(
     element whose bounds the point violates least. Points slightly outside the mesh (a coarse mesh
     cuts corners of a curved surface) are extrapolated from their nearest element.
 
-    Raises
-    ------
-    InputError
-        If ``points`` is not ``(k, 3)`` finite.
-    GeometryError
-        If a point is farther from the mesh than ``tolerance`` mm.
+    InputError if ``points`` is not ``(k, 3)`` finite. GeometryError if a point is farther from the
+    mesh than ``tolerance`` mm.
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():

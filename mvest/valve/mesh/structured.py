@@ -3,8 +3,6 @@
 Every node lies on the exact surface, so that refined meshes converge to one and the same body.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mvest.errors import InputError
@@ -22,6 +20,9 @@ def structured_mesh(
 ) -> SolidMesh:
     """Mesh of ``columns x rows x layers`` cells of a valve.
 
+    InputError if the element cannot be laid out in layers, or the numbers are too small or do not
+    divide among the leaflets. GeometryError if cells are inverted.
+
     Parameters
     ----------
     shape : MaterialSurface
@@ -32,14 +33,6 @@ def structured_mesh(
         Cells around the valve, as many for each leaflet: leaflets meet at cell boundaries.
     rows, layers : int
         Cells along the leaflets and through the thickness.
-
-    Raises
-    ------
-    InputError
-        If the element cannot be laid out in layers, or the numbers are too small or do not divide
-        among the leaflets.
-    GeometryError
-        If cells are inverted.
     """
     leaflets = len(shape.sections)
     if columns < 6 or columns % leaflets or rows < 1 or layers < 1:

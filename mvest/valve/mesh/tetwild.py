@@ -5,8 +5,6 @@ deterministic. Therefore the surface is checked first, the mesher runs in a chil
 result is checked against the surface, and the mesh is cached under the hash of its input.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import subprocess
@@ -48,6 +46,10 @@ def tetrahedralize(
 ) -> Tetrahedra:
     """Mesh the inside of a closed surface, or read the cached mesh.
 
+    ConfigurationError if the edge length is not positive. GeometryError if the surface is invalid.
+    MeshingError if the mesher failed, crashed or took too long, its mesh does not fit the surface,
+    or a cached mesh is damaged.
+
     Parameters
     ----------
     vertices, triangles
@@ -56,16 +58,6 @@ def tetrahedralize(
         Target, mm.
     store
         Cache folder. Without it the mesh is made anew, and differs each time.
-
-    Raises
-    ------
-    ConfigurationError
-        The edge length is not positive.
-    GeometryError
-        The surface is invalid.
-    MeshingError
-        The mesher failed, crashed or took too long, its mesh does not fit the surface, or a cached
-        mesh is damaged.
     """
     if not (np.isfinite(edge_length) and edge_length > 0):
         raise ConfigurationError(f"tetrahedralize: edge_length = {edge_length}; expected positive")

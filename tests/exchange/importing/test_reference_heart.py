@@ -13,7 +13,6 @@ from experiments.studies.imported import import_heart
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.plausibility import implausible_values
 from mvest.errors import InputError
-from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.proximity import closest_points
 from tests.exchange.importing.made_up_heart import (
     PARTS,
@@ -106,4 +105,4 @@ def test_the_heart_itself_is_a_plausible_valve():
     assert not implausible_values(case)
     tips = case.frames[0].papillary_tips
     assert np.linalg.norm(tips[0] - tips[1]) == pytest.approx(24.1, abs=0.5)
-    assert len(case.chordae) == len(Template().chordae())
+    assert len(case.chordae) == len(TEMPLATE.chordae())

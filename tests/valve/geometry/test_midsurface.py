@@ -21,7 +21,8 @@ from mvest.valve.geometry.walls import closed_band, walls
 
 @pytest.fixture(scope="module")
 def valve() -> Valve:
-    return Template(TemplateParameters()).valve(64, 20)
+    # The indentations of the posterior leaflet are 28 degrees wide.
+    return Template(TemplateParameters()).valve(96, 20)
 
 
 @pytest.fixture(scope="module")
