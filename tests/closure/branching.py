@@ -11,7 +11,7 @@ STRAIGHT = Template(TemplateParameters().changed({"chordae.branches": 1})).chord
 """The template's chordae without branches."""
 LOW, HIGH = 0.4, 0.6
 """Where the chordae branch, over the length from tip to leaflet."""
-SLACK = 1.1
+SLACK = 1.07
 """Least rest length over the length in the open valve, to the insertion. The patch around it, which
 the chord pulls at, has its centre up to 0.4 mm nearer to the annulus."""
 

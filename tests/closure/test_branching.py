@@ -70,7 +70,7 @@ def test_pressure_is_carried_by_chordae_and_annulus(closed):
     at_tips = (state.tension[:, None] * state.direction)[root].sum(axis=0)
     np.testing.assert_allclose(pull.sum(axis=0) - springs.sum(axis=0), at_tips, atol=1e-9)
     # Most trees are taut, some branches are slack.
-    assert np.count_nonzero(state.tension > 0.02) > 20
+    assert np.count_nonzero(state.tension[root] > 0.02) > 0.6 * np.count_nonzero(root)
     assert np.count_nonzero(state.strain < 0) > 2
     assert np.abs(springs).max() < 2e-4
 

@@ -69,7 +69,8 @@ def slope_errors(step):
 
 def test_derivatives_are_those_of_differences_everywhere():
     # Points at all distances, beyond borders and at bends: none is left out.
-    coarse, fine = slope_errors(1e-2), slope_errors(2.5e-3)
+    # Below steps of 5e-3 the rounding of the smoothed surface prevails.
+    coarse, fine = slope_errors(4e-2), slope_errors(1e-2)
     assert fine < 2e-4
     assert coarse / fine == pytest.approx(16.0, rel=0.3)
 

@@ -67,7 +67,8 @@ def test_smooth_errors_that_are_stated_as_independent_show_as_a_pattern(std, pat
     # Errors of a third of the stated size contradict nothing.
     case = replace(made_up_case(0.3), uncertainty=Uncertainty(0.3))
     rough = SpatialCorrelation(case.surface.vertices, 8.0).factor
-    smooth = std * rough @ np.random.default_rng(3).standard_normal(case.surface.vertices.shape)
+    smooth = rough @ np.random.default_rng(3).standard_normal(case.surface.vertices.shape)
+    smooth *= std / np.sqrt(np.mean(smooth**2))  # few independent patches: not near 1 by itself
     frames = tuple(
         replace(f, vertices=f.vertices + smooth) if f.role is Role.CLOSED else f
         for f in case.frames

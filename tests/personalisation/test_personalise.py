@@ -148,9 +148,10 @@ def test_surfaces_are_compared_without_correspondence():
     # anterior modulus; smoothing this coarse surface adds half a per cent.
     np.testing.assert_allclose(found.result.estimate[:2], true_of(found)[:2], rtol=0.03)
     assert abs(found.result.estimate[2]) < 0.02
+    # Three per cent of the posterior modulus move its belly, of 12 mm over the modulus, by 0.14 mm.
     for one in found.frames:
         assert len(one.distances["personalised"]) == 288
-        assert one.distances["personalised"].max() < 0.05 < one.distances["generic"].max()
+        assert one.distances["personalised"].max() < 0.14 < one.distances["generic"].max()
     assert found.alternatives["paper"].observation.correlation_length_mm == 0.0
     positions = found.frames[0].positions
     np.testing.assert_array_equal(positions["registered"], positions["generic"])

@@ -106,7 +106,9 @@ def test_arrays_are_those_that_a_report_reads(tmp_path, fit, corresponds):
     # The tips lie below the annulus, however the valve lies.
     for turn in Rotation.random(6, rng=1).as_matrix():
         turned = {
-            name: values @ turn if values.dtype.kind == "f" and values.ndim > 1 else values
+            name: values @ turn
+            if values.dtype.kind == "f" and values.shape[-1:] == (3,)
+            else values
             for name, values in arrays.items()
             if not name.startswith("distance")
         }

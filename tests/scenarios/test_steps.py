@@ -36,23 +36,30 @@ def closing():
 
 
 def test_the_open_valve_is_the_template(closing):
-    _, _, steps = closing
+    model, _, steps = closing
     first = steps[0]
     assert first["smallest det F"] == pytest.approx(1.0, abs=1e-12)
     assert first["intersections"] == 0
     assert first["coaptation"] == 0.0
-    # Seen from the atrium the opening lies within the open free edge, the lens between
-    # y = 1.83 + 6.5 and 1.83 - 10.5 and x = +-15.5 of 2/3 (parabolas): 17 x 31 x 2/3 = 351 mm2,
-    # less half a thickness along its rim of some 75 mm.
-    assert 200 < first["orifice"] < 351
+    # Seen from the atrium the opening lies within the open free edge, less half a thickness of
+    # 0.75 x 1.3 mm along its rim.
+    edge = model.valve.surface.vertices[model.valve.free_edge, :2]
+    rim = np.roll(edge, -1, axis=0)
+    lens = 0.5 * abs(np.sum(edge[:, 0] * rim[:, 1] - edge[:, 1] * rim[:, 0]))
+    around = np.linalg.norm(rim - edge, axis=1).sum()
+    assert 100 < lens < 130
+    assert lens - 0.49 * around < first["orifice"] < lens
 
 
 def test_chordae_are_measured_with_the_factors_of_the_run(closing):
     model, result, steps = closing
     chordae, cables = model.valve.chordae, result.system.cables
+    c, branch = len(chordae.insertion), chordae.parent[:, None] >= 0
     for step in (0, -1):
-        ends = cables.patches(result.simulation.frames[step])
-        span = np.linalg.norm(ends - model.valve.papillary_tips[chordae.tip], axis=1)
+        x, tips = result.simulation.frames[step], model.valve.papillary_tips
+        ends = np.concatenate([cables.patches(x), cables.state(x, tips, 2.0, 0.95).end[c:]])
+        starts = np.where(branch, ends[c + chordae.parent], tips[chordae.tip])
+        span = np.linalg.norm(ends - starts, axis=1)
         strain = span / (0.95 * chordae.rest_length) - 1
         force = 2.0 * chordae.axial_stiffness * cable_force(strain, chordae.toe_strain)[0]
         assert steps[step]["chord strain"] == pytest.approx(strain.max(), rel=1e-12)
