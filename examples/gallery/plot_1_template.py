@@ -22,9 +22,7 @@ posterior = LeafletDimensions(length=18.0, thickness=1.26, belly=0.07)
 anatomies = {
     "template": mvest.TemplateParameters(),
     "wide annulus": mvest.TemplateParameters(annulus=AnnulusDimensions(41.0, 30.0)),
-    "long posterior leaflet": mvest.TemplateParameters(
-        leaflets=LeafletPair(posterior=posterior)
-    ),
+    "long posterior leaflet": mvest.TemplateParameters(leaflets=LeafletPair(posterior=posterior)),
 }
 drawn = []
 figure, panels = plt.subplots(2, 3, figsize=(9, 6.2), layout="constrained")
