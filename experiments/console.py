@@ -60,7 +60,7 @@ def raised() -> Iterator[None]:
         stopped = False
         signal.pthread_kill(threading.main_thread().ident or 0, number)
 
-    def dropped(lost: sys.UnraisableHookArgs) -> None:
+    def dropped(lost: "sys.UnraisableHookArgs") -> None:
         if isinstance(lost.exc_value, Interruption):
             threading.Timer(AGAIN_S, again, (lost.exc_value.status - 128,)).start()
         else:

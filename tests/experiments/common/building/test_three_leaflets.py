@@ -77,12 +77,15 @@ def test_one_modulus_of_each_leaflet_is_estimated_from_another_mesh(values):
     other = (
         "truth=independent",
         "truth.refine=1",
-        "truth.columns=36",
-        "truth.rows=4",
+        "mesh.columns=36",
+        "mesh.rows=4",
+        "truth.columns=54",
+        "truth.rows=6",
         "truth.dt_factor=1",
     )
     twin = build_twin(values(*LIGHT, *other))
     (found,) = estimate_twin(twin, [1])
     assert found.converged
-    # Coarse cells; the moduli of two leaflets exchanged would be off by half.
-    assert found.estimate == pytest.approx(twin.truth_values, rel=0.05)
+    # The smallest leaflet between two indentations is 10.7 % off with 24 x 3 cells and 7.4 % with
+    # these; the moduli of two leaflets exchanged would be off by half.
+    assert found.estimate == pytest.approx(twin.truth_values, rel=0.1)
