@@ -40,8 +40,8 @@ GENERIC_THICKNESS = {"anterior": 1.32, "posterior": 1.26}
 
 CLOSED_DEPTH = 0.74
 """Depth of the free edge below the annulus, closed over open, if there is no closed frame: the mean
-(SD 0.02) in thirteen simulated valves, varied from the template with random moduli (36 x 4 cells).
-The depth falls from 13.2 to 9.8 mm on average."""
+(SD 0.02) in the 13 of 16 simulated valves that closed, varied from the template with random moduli
+(36 x 4 cells). The depth falls from 13.2 to 9.8 mm on average."""
 
 SEEN_CLOSURE = replace(ChordLayout(), marginal_slack=1.003, basal_slack=1.005)
 """The template's layout for an observed closed valve instead of the template's intended closure.

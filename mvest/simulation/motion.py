@@ -59,7 +59,7 @@ class MotionLimits:
     #: mm, between the free edges of the closed valve, the median over its middle half. The rough
     #: zone of the longer anterior leaflet passes below the posterior edge: 7.6 mm (SD 0.6) in
     #: thirteen valves of the default anatomy (36 x 4 cells), drawn as for a population. The limit
-    #: is three SDs more. On 24 x 3 cells some moduli lead to another closed state, of 10.1 mm.
+    #: is three SDs more. On 24 x 3 cells two of four closures of the default valve have 10 mm.
     edge_gap: Place = 9.5
     #: mm, by which the free edge of the closed valve may rise above its annulus plane.
     edge_height: Place = 0.0

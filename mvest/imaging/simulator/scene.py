@@ -272,7 +272,7 @@ def _mottled(grid: tuple[int, ...], level_db: float, rng: np.random.Generator) -
 
 
 def _chord(leaflets: FloatArray, tip: FloatArray, phi: float, s: float) -> FloatArray:
-    """From a papillary tip ``(T, 3)`` to the insertion: ``(T, 2, 3)``."""
+    """A straight line ``(T, 2, 3)`` from a papillary tip ``(T, 3)`` to a leaflet end of a tree."""
     rows, columns = leaflets.shape[1:3]
     c, r = phi / 360.0 * columns, s * (rows - 1)
     i, j = int(np.floor(c)), min(int(r), rows - 2)
