@@ -237,25 +237,27 @@ def test_an_imaged_patient_is_closed_as_a_patient_and_nowhere_displaced(monkeypa
         held_pressure_mmHg=(80.0,), held_relaxation=(0.2,), held_tips=(0.0, 0.0, 0.0)
     )
     closure, rest = MadeUpClosure(tuple(hidden)), made_up_closure.VALVE.surface.vertices
+    template = made_up_closure.TEMPLATE
 
     def close(drawn, _):
         assert drawn.values == hidden
-        tips = TEMPLATE.papillary_tips + np.linspace(1, 0, 4)[:, None, None] * drawn.tip_motion
+        tips = template.papillary_tips + np.linspace(1, 0, 4)[:, None, None] * drawn.tip_motion
         return [rest * (1 - 0.01 * k) for k in range(4)], list(tips), closure
 
     monkeypatch.setattr(patients, "closing_frames", close)
     monkeypatch.setattr(virtual_patient, "_model", lambda *_: closure)
     settings = replace(SMALL, limits=motion.MotionLimits(2.0, 50.0, 50.0, 10.0, 100_000))
     displaced = {**hidden, **dict.fromkeys(REGISTRATION, 3.0)}
-    made = simulate_imaged_patient(drawn_valve("p", displaced), simulation, settings)
+    drawn = replace(drawn_valve("p", displaced), template=template)
+    made = simulate_imaged_patient(drawn, simulation, settings)
     assert (made.closed, made.pressure_mmHg, made.values) == (3, 100.0, hidden)
     # The formula, not the coarse closed frame.
     expected = [rest, 0.99 * rest, 0.98 * rest, made_up_closure.shape(hidden, 100.0)]
     np.testing.assert_allclose(made.valve.vertices[:4], expected)
-    closed = TEMPLATE.papillary_tips
+    closed = template.papillary_tips
     for frame, share in ((0, 1.0), (1, 2 / 3), (2, 1 / 3), (3, 0.0), (4, 0.2)):
         np.testing.assert_allclose(made.valve.tips[frame], closed + share * TIP_MOTION)
-    np.testing.assert_array_equal(made.stated.chordae.rest_length, TEMPLATE.chordae().rest_length)
+    np.testing.assert_array_equal(made.stated.chordae.rest_length, template.chordae().rest_length)
     moving = replace(MECHANICS, protocol=replace(MECHANICS.protocol, equilibrium=False))
     with pytest.raises(InputError, match="equilibrium = False, expected True"):
         simulate_imaged_patient(drawn_valve("p", hidden, moving), simulation, SMALL)
