@@ -90,7 +90,7 @@ def test_published_verdicts_are_of_the_anatomies_that_ship():
             along = row["variation"].startswith("along")
             assert row["max"] <= (JUMP_LIMIT if along else MAX_LIMIT)
             assert along or row["mean"] <= MEAN_LIMIT
-        # All valves close, seen as predictions see them; dilated and tethered leaflets do not coapt.
+        # All valves close, as predictions see them; dilated and tethered leaflets do not coapt.
         measured = {row["quantity"]: row["value"] for row in record.table_of("physiology").rows}
         assert measured["closed gap"] == 0.0
         coapts = measured["coaptation height, middle section"] > 1.0
