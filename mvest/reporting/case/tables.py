@@ -64,20 +64,13 @@ def frame_table(frames: Sequence[FrameFit]) -> Table:
 
 
 def physiology_table(rows: Iterable[Row]) -> Table:
-    """Quantities of a valve beside published ranges; rows as of `mvest.closure.physiology.Row`.
-
-    A quantity outside its range says so with both.
-    """
+    """Quantities of a valve beside published ranges; rows as of `mvest.closure.physiology.Row`."""
 
     def shown(row: Row) -> Row:
-        low, high, unit = row["low"], row["high"], row["unit"]
+        low, high = row["low"], row["high"]
         ends = [number(end) for end in (low, high) if end is not None]
         words = "at most " if low is None else "at least " if high is None else ""
-        published = words + " to ".join(ends) if ends else ""
-        marked = row["mark"]
-        if marked == "outside":
-            marked += f": {number(row['value'])} {unit}".rstrip() + f", {published} {unit}".rstrip()
-        return {**row, "published": published, "mark": marked}
+        return {**row, "published": words + " to ".join(ends) if ends else ""}
 
     return table(
         map(shown, rows),
