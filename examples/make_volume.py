@@ -22,7 +22,7 @@ TISSUE = {"anterior": mvest.TissueSettings(2.65), "posterior": mvest.TissueSetti
 
 def make_volume(frames=4, seed=3):
     """The volume and, for comparison, where the valve in it truly is."""
-    template = mvest.Template(mvest.TemplateParameters(AnnulusDimensions(17.2, 13.4)))
+    template = mvest.Template(mvest.TemplateParameters(AnnulusDimensions(34.4, 22.0)))
     settings = MotionSettings(frames=frames, held_pressure=(), held_relaxation=())
     drawn = DrawnValve("example", template, MODULI, mvest.MechanicsSettings(TISSUE))
     valve = close_in_motion(drawn, settings)
