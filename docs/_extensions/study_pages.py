@@ -24,7 +24,9 @@ EARLIER = (
     "Results of the default valve and of the anatomies made from it are of the earlier default "
     "valve, without scallops and with straight chordae, until they are run anew."
 )
-PRESENT = ("table1", "models", "shells", "strip", "donor", "reference_heart")
+PRESENT = (
+    "table1", "gate", "closure", "tissue", "models", "shells", "strip", "donor", "reference_heart",
+)  # fmt: skip
 """Pages whose results are of the present default valve, or of no such valve."""
 
 LAST = "Further studies"
