@@ -25,7 +25,7 @@ def test_every_field_is_in_the_readme_and_no_other():
 
 
 def test_the_table_of_branching_chordae_has_all_columns():
-    (table,) = re.findall(r"```csv\n(.*?)```", README, flags=re.DOTALL)
+    (table,) = re.findall(r"```text\n(.*?)```", README, flags=re.DOTALL)
     head, *rows = (line.split(",") for line in table.splitlines())
     assert tuple(head) == (*CHORD_COLUMNS, *BRANCH_COLUMNS)
     assert [row[-2:] for row in rows] == [["", "A"], ["A", ""], ["A", ""]]
