@@ -49,7 +49,7 @@ from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reporting.skill import skill_table, verdict_table
 from mvest.reporting.tables import Column, Table, table
-from mvest.simulation.imaged_patient import IMAGED, ImagedPatient, simulate_imaged_patient
+from mvest.simulation.imaged_patient import ImagedPatient, simulate_imaged_patient
 from mvest.simulation.motion import DrawnValve, MotionSettings
 from mvest.simulation.population import draw_tip_motion
 from mvest.simulation.virtual_patient import PatientSettings, draw_patient_values, first_that_closes
@@ -157,7 +157,7 @@ def _simulate(values: Values, patient: PatientSettings) -> Made:
     def simulate(drawn: Template) -> ImagedPatient:
         motion = draw_tip_motion(drawn, rng)
         valve = DrawnValve(patient.name, drawn, hidden, mechanics, motion)
-        return simulate_imaged_patient(valve, IMAGED, MotionSettings())
+        return simulate_imaged_patient(valve, MotionSettings())
 
     made, draws = first_that_closes(
         template_of(values), patient.variation, MAX_DRAWS, rng, simulate

@@ -229,7 +229,7 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
     unknowns = (
         Prior("E_f.anterior", 6.23, 3.1),
         Prior("E_f.posterior", 2.09, 1.05),
-        Prior("pressure_scale", 1.0, 0.1 if from_volume else CUFF),
+        Prior("pressure_scale", 1.0, CUFF),
         Prior("chord_stiffness", 1.0, 0.2),
         Prior("chord_rest_length", 1.0, 0.02),
         *(

@@ -33,12 +33,15 @@ SCALE = (1.0, 1.5)
 TIP_MOTION_MM = (1.0, 3.0)
 """Range of the distance that a papillary tip moves during closure."""
 MEDIANS = {
-    "E_f.anterior": (6.23, 0.35),
-    "E_f.posterior": (2.09, 0.35),
-    "pressure_scale": (1.0, 0.12),
-    "chord_rest_length": (1.0, 0.015),
+    "E_f.anterior": (6.23, 0.47),
+    "E_f.posterior": (2.09, 0.47),
+    "pressure_scale": (1.0, 0.15),
+    "chord_stiffness": (1.0, 0.2),
+    "chord_rest_length": (1.0, 0.02),
 }
-"""Median (moduli in MPa, the paper's for a normal valve) and SD of the logarithm."""
+"""Median (moduli in MPa, the paper's for a normal valve) and SD of the logarithm: the prior of the
+estimator (`mvest.personalisation.settings.default_settings`), so that detectors are calibrated on
+the valves that it expects."""
 DURATION_SPREAD = 0.15
 """SD of the logarithm of the duration about that of the settings."""
 
