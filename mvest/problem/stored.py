@@ -74,10 +74,11 @@ class StoredModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrapolated:
-    """Predictions extrapolated to zero mesh size, assuming an error linear in the mesh size.
+    """Predictions extrapolated to zero mesh size, with an error of second order in the mesh size.
 
-    Richardson 1911, Phil. Trans. R. Soc. A 210:307. Closed valves of quadratic tetrahedra converge
-    with nearly order one: leaflets bend sharply at contact, and chordae and annulus pull at lines.
+    Richardson 1911, Phil. Trans. R. Soc. A 210:307. Against `hex18` on 144 x 16 cells, which is
+    within 1 % of its limit, closed valves of quadratic tetrahedra on 90 x 10 to 126 x 14 cells
+    converge with the orders 1.8 (effect on the anterior modulus) and 2.4 (posterior).
     """
 
     fine: StoredModel
@@ -94,4 +95,4 @@ class Extrapolated:
     def correction(self, m: FloatArray) -> FloatArray:
         """Difference ``(n,)`` mm of the extrapolation from the fine mesh's prediction."""
         difference = self.fine(m).y - self.coarse(m).y
-        return np.asarray(self.share / (1 - self.share) * difference)
+        return np.asarray(self.share**2 / (1 - self.share**2) * difference)

@@ -1,9 +1,10 @@
 """One simulated valve over a systole: closed step by step, then held under falling pressure.
 
-The closure is that of :mod:`mvest.closure.model`, with the steps of the pressure's rise as frames. A valve snaps shut within a small share of this rise. So frames are chosen evenly
-along the path of the free edge and shown evenly over time: they look like a systole, but slower
-than a real closure. After the closed frame, the valve is held at lower pressures while annulus and
-papillary tips return part of their way, each in equilibrium. Motions that no valve shows are
+The closure is that of :mod:`mvest.closure.model`, with the steps of the pressure's rise as frames.
+A valve snaps shut within a small share of this rise. So frames are chosen evenly along the path of
+the free edge and shown evenly over time: they look like a systole, but slower than a real closure.
+After the closed frame, the valve is held at lower pressures while annulus and papillary tips return
+part of their way, each in equilibrium. Motions that no valve shows are
 refused, so that no detector learns from them.
 """
 
@@ -121,8 +122,8 @@ class MotionSettings:
     columns: PointsAround = 64  #: vertices of the returned layout
     rows: PointsAlong = 15
     element: str = "hex18"
-    #: Cells of the mesh that is closed: that of virtual patients. On 24 x 3 cells the same valve closes
-    #: 0.04 to 0.2 mm elsewhere in the mean, which reads as 13 to 24 % of a modulus.
+    #: Cells of the mesh that is closed: that of virtual patients. On 24 x 3 cells the same valve
+    #: closes 0.04 to 0.2 mm elsewhere in the mean, which reads as 13 to 24 % of a modulus.
     mesh_columns: CellsAround = 54
     mesh_rows: CellsAlong = 6
     contact_columns: PointsAround = 168  #: points at which contact is sampled

@@ -17,16 +17,16 @@ def stored(folder: Path, size: float, converged: bool = True) -> StoredModel:
     def model(m: Any) -> Prediction:
         if not converged:
             return Prediction.failed("does not close")
-        return Prediction(np.array([2.0, -1.0]) * m[0] + size * np.array([1.0, 3.0]), np.eye(2))
+        return Prediction(np.array([2.0, -1.0]) * m[0] + size**2 * np.array([1.0, 3.0]), np.eye(2))
 
     return StoredModel(model, folder, f"cells of {size:g}")
 
 
-def test_what_is_linear_in_the_size_of_cells_comes_out_at_size_zero(tmp_path: Path) -> None:
+def test_what_is_quadratic_in_the_size_of_cells_comes_out_at_size_zero(tmp_path: Path) -> None:
     truth = Extrapolated(stored(tmp_path, 0.2), stored(tmp_path, 0.3), 0.2 / 0.3)
     at = np.array([5.0, 0.0])
     np.testing.assert_allclose(truth(at).y, [10.0, -5.0], atol=1e-12)
-    np.testing.assert_allclose(truth.correction(at), [-0.2, -0.6], atol=1e-12)
+    np.testing.assert_allclose(truth.correction(at), [-0.04, -0.12], atol=1e-12)
 
 
 @pytest.mark.parametrize("failing", [0, 1])
