@@ -34,7 +34,7 @@ from mvest.quantities import (
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
-from mvest.valve.geometry.proximity import intersecting_triangles
+from mvest.valve.geometry.proximity import closest_points, intersecting_triangles
 from mvest.valve.geometry.triangles import surface_edges
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import orifice_area
@@ -55,11 +55,11 @@ class MotionLimits:
     #: Share of the open valve's orifice that midsurfaces may leave open in the closed one. A closed
     #: valve leaves some 5 %, as midsurfaces keep a thickness apart; a tethered one more.
     orifice: Factor = 0.15
-    #: mm, between the free edges of the closed valve, the median over its middle half. The rough
-    #: zone of the longer anterior leaflet passes below the posterior edge: 7.6 mm (SD 0.6) in
-    #: thirteen valves of the default anatomy (36 x 4 cells), drawn as for a population. The limit
-    #: is three SDs more. On 24 x 3 cells two of four closures of the default valve have 10 mm.
-    edge_gap: Place = 9.5
+    #: mm, from the free edge of the closed posterior leaflet to the anterior one, the median over
+    #: its middle half. Midsurfaces that touch keep a thickness of 1 mm apart; the rest is for a
+    #: tethered valve that hardly coapts. The distance between both free edges would not do: the
+    #: rough zone of the longer anterior leaflet passes 7 to 12 mm below the posterior edge.
+    edge_gap: Place = 3.0
     #: mm, by which the free edge of the closed valve may rise above its annulus plane.
     edge_height: Place = 0.0
     #: Length of an edge of the layout over its length in the open valve; at most one edge in a
@@ -98,11 +98,14 @@ def check_motion(valve: MovingValve, closed: int, limits: MotionLimits) -> None:
         raise RefusedError(
             valve.name, f"closed it leaves {areas[1]:.0f} of {areas[0]:.0f} mm2 of its orifice open"
         )
-    edge = valve.vertices[closed][layout.free_edge]
-    middle = np.arange(layout.columns // 8, 3 * layout.columns // 8 + 1)
-    gap = float(np.median(np.linalg.norm(edge[middle] - edge[-middle], axis=1)))
+    edge = vertices[layout.free_edge]
+    posterior = edge[5 * layout.columns // 8 : 7 * layout.columns // 8 + 1]
+    anterior = layout.triangles[layout.region == 0]
+    gap = float(np.median(closest_points(posterior, vertices, anterior).distance))
     if gap > limits.edge_gap:
-        raise RefusedError(valve.name, f"the free edges of the closed valve lie {gap:.1f} mm apart")
+        raise RefusedError(
+            valve.name, f"its closed posterior edge lies {gap:.1f} mm from the anterior leaflet"
+        )
     height = -float(plane.coordinates(edge)[:, 2].min())
     if height > limits.edge_height:
         raise RefusedError(

@@ -113,7 +113,7 @@ CROSSED = REST - [[0.0, 2.0, 0.0]] * LAYOUT.s[:, None] * (REST - 1.8)
     ("limits", "vertices", "words"),
     [
         ({}, REST, "of its orifice open"),
-        ({"orifice": 2.0}, REST, "mm apart"),
+        ({"orifice": 2.0}, REST, "mm from the anterior leaflet"),
         ({"orifice": 2.0, "edge_gap": 50.0, "stretch": 10.0}, FLAILING, "above the annulus"),
         ({"orifice": 5.0, "edge_gap": 50.0}, 1.7 * REST, "stretched to 1.70"),
         ({"orifice": 2.0, "edge_gap": 50.0, "stretch": 10.0}, CROSSED, "pass through each other"),
