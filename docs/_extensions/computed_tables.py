@@ -15,12 +15,12 @@ from docutils import nodes
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
-from study_pages import comment_of
 
 from experiments.common.config import Config
 from experiments.common.schema import hints_of
 from experiments.common.study import load_study, study_names
 from experiments.results.published import records_of
+from experiments.results.renewal import configured
 from mvest.mechanics.parameters import KINDS
 from mvest.quantities import Within
 from mvest.reporting.skill import GENERIC, skill_table, stated
@@ -102,11 +102,10 @@ def marks_in(kind: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 def sweep_list() -> str:
     """The sweeps with their descriptions."""
     rows = []
-    for path in sorted((ROOT / "conf" / "sweep").glob("*.yaml")):
-        about = comment_of(path.read_text(encoding="utf-8"))
-        page = (ROOT / "docs" / "studies" / f"sweep_{path.stem}.md").is_file()
-        name = f"[`{path.stem}`](studies/sweep_{path.stem}.md)" if page else f"`{path.stem}`"
-        rows.append([name, about])
+    for one in configured(ROOT / "conf" / "sweep"):
+        page = (ROOT / "docs" / "studies" / f"{one.name}.md").is_file()
+        name = f"[`{one.stem}`](studies/{one.name}.md)" if page else f"`{one.stem}`"
+        rows.append([name, one.about])
     return markdown(["sweep", "question"], rows)
 
 

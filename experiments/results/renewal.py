@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -26,7 +26,7 @@ from experiments.common.places import CONF
 from experiments.common.progress import say
 from experiments.common.records.record import Record
 from experiments.common.study import is_present, load_study
-from experiments.results.published import RECORDS, publish_as, records_of, unpublish
+from experiments.results.published import publish_as, records_of, unpublish
 from experiments.runner.compose import expand, make_plan
 from experiments.runner.jobs import Request
 from experiments.runner.plan import Plan
@@ -34,9 +34,11 @@ from experiments.runner.plugins import register_plugins
 from experiments.runner.sweep import run_plan, share_of
 from experiments.sweeps.collected import SWEEPS, head_of, read_sweep
 from mvest.errors import ConfigurationError, MvestError
+from mvest.provenance import NUMBERS
 from mvest.reporting.tables import Column, table
 
 FULL = "full"  # size of published sweeps
+WITHOUT = "without_records.yaml"  # generations of pages of results that have no records
 
 
 @dataclass(frozen=True)
@@ -179,14 +181,12 @@ class Status:
         return None if self.seconds is None else self.to_make * self.seconds / 3600.0
 
     @property
-    def sentence(self) -> str:
-        """What a page says of stale results; empty if all are of today."""
-        if not self.to_make and not self.stale:
-            return ""
-        stale = f"{self.stale} stale ({self.why} changed)" if self.stale else ""
-        missing = f"{self.missing} missing" if self.missing else ""
-        found = " and ".join(filter(None, (stale, missing)))
-        return f"{self.of.name}: of {self.of.jobs} runs {found}"
+    def text(self) -> str:
+        """What is stale or missing; empty if every run is of today."""
+        jobs = f" of {self.of.jobs} runs" if self.of.has_many else ""
+        counts = {"stale": self.stale, "missing": self.missing}
+        parts = [f"{count}{jobs} {name}" for name, count in counts.items() if count]
+        return f"{self.of.name} ({', '.join(parts)})" if parts else ""
 
 
 def status_of(one: Configured, results: Path) -> Status:
@@ -290,13 +290,16 @@ def listing(statuses: Sequence[Status], results: Path) -> str:
     total = f"{jobs} jobs to make, about {sum(filter(None, hours)):.1f} CPU hours"
     if unknown:
         total += f", and the unknown ones of {unknown} studies"
-    return "\n".join([table(rows, **about).text(), total, *without_records(results)])
-
-
-def without_records(results: Path) -> Iterator[str]:
-    """A line that names pages of results without records, which other commands wrote."""
-    tables = {path.stem for path in (results / RECORDS).glob("*.jsonl")}
-    tables |= {f"sweep_{path.stem}" for path in (results / SWEEPS).glob("*.json")}
-    others = sorted(path.stem for path in results.glob("*.md") if path.stem not in tables)
+    others = [f"{name} (stale)" if old else name for name, old in without_records(results).items()]
     if others:
-        yield f"without records, so not renewed here: {', '.join(others)}"
+        total += f"\nwithout records, written by other commands: {', '.join(others)}"
+    return f"{table(rows, **about).text()}\n{total}"
+
+
+def without_records(results: Path) -> dict[str, bool]:
+    """Page of results without a record -> whether it is stale, by the file that lists them."""
+    path = results / WITHOUT
+    listed = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return {
+        name: any(NUMBERS[kind] != of for kind, of in made.items()) for name, made in listed.items()
+    }
