@@ -79,7 +79,13 @@ class Target:
 TARGETS = (
     Target("error over guess", 0, 0.5, "median error {0:.2f} of the guess's (at most 0.5)"),
     *(
-        Target(f"{leaflet} in SE", -2, 2, f"{leaflet} moduli off by {{0:+.1f}} standard errors (2)")
+        Target(
+            f"{leaflet} in SE",
+            -2,
+            2,
+            f"{leaflet} moduli off by {{{leaflet} off:+.0f}} ± {{{leaflet} off SE:.0f}} % "
+            "on average (two standard errors)",
+        )
         for leaflet in LEAFLETS
     ),
     Target("judged coverage", 90, 98, "{0:.0f} % of trusted intervals hold (90 to 98 %)"),
@@ -95,8 +101,10 @@ def believed(results: Path) -> Table:
     rows = [row for mode in MODES if (row := _row(mode.name, mode.runs(results)))]
     rows.sort(key=lambda row: (-len(missed(row)), -(row["error over guess"] or 0.0)))
     percent, hidden = Column("%"), Column(hidden=True)
-    about = dict.fromkeys(("mode", "patients", "n"), Column())
-    about |= {
+    about = {
+        "mode": Column(label="where the valve comes from"),
+        "patients": Column(),
+        "n": Column(label="estimates"),
         "median error": percent,
         "guess": Column("%", label="the same of the generic guess"),
         "ratio": Column("%", label="median error of the ratio"),
@@ -104,13 +112,13 @@ def believed(results: Path) -> Table:
     }
     for leaflet in LEAFLETS:
         label = f"bias of the {leaflet} logarithm ± SE"
-        about[f"bias {leaflet}"] = Column(digits="+.3f", std=f"SE {leaflet}", label=label)
+        about[f"bias {leaflet}"] = Column(digits=".3f", std=f"SE {leaflet}", label=label)
     about |= {
         "coverage": Column("%", ".0f", "", "coverage low", "coverage high", label="trusted inside"),
         "mean square": Column(digits=".2f", label="mean square of trusted standardised errors"),
         "trusted": Column("%", ".0f"),
         "without": Column(label="without an estimate"),
-        "minutes": Column("min", ".1f", label="CPU for one"),
+        "minutes": Column("min", ".1f", label="CPU of an estimation"),
     }
     others = {name for row in rows for name in row} - set(about)
     return table(rows, **about, **dict.fromkeys(sorted(others), hidden))
