@@ -20,7 +20,7 @@ from experiments.results.published import records_of
 from experiments.results.renewal import chosen, status_of
 from mvest.problem.record import EstimateRecord
 from mvest.problem.verdict import TRUSTWORTHY
-from mvest.reporting.skill import GENERIC, skill, stated, trust_of
+from mvest.reporting.skill import GENERIC, log_width, skill, stated, trust_of
 from mvest.reporting.tables import Column, Table, table
 
 REFERENCE = "reference"  # scenario without a wrong assumption
@@ -158,6 +158,7 @@ def _row(mode: str, runs: Sequence[tuple[Record, EstimateRecord]]) -> dict[str, 
         "judged square": good["mean square"] if judged else None,
         "intervals": good.get("n", 0),
         "inside": good.get("inside", 0),
+        "factor": float(np.exp(np.nanmedian([log_width(own) for own in moduli]) / 2)),
         "trusted": 100.0 * len(trusted) / len(estimates) if _is_judged(estimates) else None,
         "without": lost,
         "lost": lost / len(estimates),

@@ -151,13 +151,15 @@ def regenerate(results: Path) -> list[Path]:
             f"{results / RECORDS} holds no record; run an experiment first, for example "
             "mvest run experiment=table1"
         )
+    from experiments.results.quoted import requote
+
     written: list[Path] = []
     for path in paths:
         found = records_of(results, path.stem)
         written += write_results(results, load_study(found.first.study), found)
     for sweep in sweeps:
         written += write_sweep(results, sweep)
-    return written
+    return [*written, *requote(results.resolve().parent / "README.md", results)]
 
 
 def records_of(results: Path, table: str) -> Results:

@@ -234,6 +234,9 @@ def run_results(studies: Sequence[str], run: bool, shard: str, results: Path) ->
         except MvestError as error:
             say(f"failed: {one.of.name}: {error}")
             failed += 1
+    from experiments.results.quoted import requote
+
+    requote(results.resolve().parent / "README.md", results)
     return 1 if failed else 0
 
 
