@@ -165,15 +165,19 @@ def index_of(pages: list[Page]) -> str:
         "figures from `results/`, with commit and configuration. Everything is simulated, except "
         "the donor valve and the shape of the reference heart.",
     ]
-    stale = [f"[{page.title}]({page.name}.md)" for page in pages if page.stale]
-    if stale:
+    if stale := sum(bool(page.stale) for page in pages):
         parts.append(
-            f"**Stale or incomplete**, by code and configuration of today: {', '.join(stale)}."
+            f"Results of {stale} of {len(pages)} pages are stale or incomplete, by the code and "
+            "configuration of today; these are marked."
         )
     for group in dict.fromkeys(page.group for page in pages):
         members = [page for page in pages if page.group == group]
         names = "\n".join(f"{page.title} <{page.name}>" for page in members)
-        lines = [f"* [{page.title}]({page.name}.md). {question_of(page)}" for page in members]
+        lines = [
+            f"* [{page.title}]({page.name}.md). {question_of(page)}"
+            + (" *Stale.*" if page.stale else "")
+            for page in members
+        ]
         parts.append(f"## {group}\n\n" + "\n".join(lines))
         parts.append(f"```{{toctree}}\n:hidden:\n:caption: {group}\n\n{names}\n```")
     return "\n\n".join(parts) + "\n"

@@ -92,8 +92,8 @@ class Configured:
             kept = read_sweep(path).records if path.is_file() else []
             return {record.provenance.config_hash: record for record in kept}
         name = self.values.get("name", self.stem)
-        kept = records_of(results, self.table).records
-        return {key: record for key, record in kept.items() if record.experiment == name}
+        every = records_of(results, self.table).records
+        return {key: record for key, record in every.items() if record.experiment == name}
 
     def plan(self, results: Path) -> Plan:
         """All its jobs, composed; raises Hydra's and OmegaConf's errors, or an `MvestError`."""
