@@ -140,7 +140,7 @@ def stale_text(page: Page, results: Path) -> str:
         return ""
     command = f"mvest results {' '.join(one.of.name for one in found)} --run"
     word = "Stale" if any(one.stale for one in found) else "Incomplete"
-    return f"**{word}**: {', '.join(one.text for one in found)}. `{command}` makes them."
+    return f"**{word}**: {', '.join(one.text for one in found)}. Renew with `{command}`."
 
 
 def picture_text(stem: str, caption: str = "") -> str:

@@ -130,7 +130,11 @@ def run_plan(plan: Plan, jobs: Sequence[Request]) -> Sweep:
     try:
         ended = _run(plan, jobs, settings)
     except KeyboardInterrupt:
-        _publish_jobs(plan)
+        done = earlier(plan.jobs)  # a job that was cut off may have left a failure
+        kept = [
+            job for job in plan.jobs if job.config_hash in done and done[job.config_hash].converged
+        ]
+        _publish_jobs(kept)
         raise
     # Others may have finished jobs meanwhile.
     return finish(plan, {**earlier(plan.jobs), **ended})
@@ -205,7 +209,7 @@ def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
         if path.suffix in (".md", ".png"):
             print(f"Written to {path}")
     write_atomically(plan.folder / TABLE, sweep_table(found).to_parquet())
-    _publish_jobs(plan)
+    _publish_jobs(plan.jobs)
     results = plan.common["paths"]["results"]
     if plan.publish and all(one.reason != NOT_RUN for one in found.records):
         publish_sweep(Path(results), found)
@@ -214,7 +218,7 @@ def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
     return found
 
 
-def _publish_jobs(plan: Plan) -> None:
+def _publish_jobs(jobs: Sequence[Request]) -> None:
     publish_runs(
         (
             job.publish_as,
@@ -222,7 +226,7 @@ def _publish_jobs(plan: Plan) -> None:
             job.folder,
             Path(job.values["paths"]["results"]),
         )
-        for job in plan.jobs
+        for job in jobs
         if job.publish_as
     )
 

@@ -145,6 +145,21 @@ def test_an_interrupt_leaves_what_is_finished(mvest, monkeypatch):
     assert {path: path.stat().st_mtime_ns for path in done} == done
 
 
+def test_a_job_that_was_cut_off_is_not_published_as_failed(mvest, monkeypatch):
+    Path("raise-1").touch()
+    real = sweep.run_jobs
+
+    def interrupted(*given):
+        list(real(*given))
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(sweep, "run_jobs", interrupted)
+    # All have the seed 1, so one has failed.
+    assert mvest(TABLE, "--run")[0] == 130
+    assert found()[:2] == (4, 1)
+
+
 def test_shards_partition_the_jobs_of_everything_published():
     every = [(one.name, k) for one in published() for k in range(one.jobs)]
     parts = [
