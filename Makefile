@@ -18,7 +18,7 @@ INSTALLED := .venv/.installed
 FILES := .venv/.files
 DEVELOP := .venv/.develop
 
-.PHONY: help install reproduce tables test test-all fuzz docs bench lint format dashboard screenshot slurm-check lock clean
+.PHONY: help install reproduce results tables test test-all fuzz docs bench lint format dashboard screenshot slurm-check lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -53,6 +53,9 @@ reproduce: $(INSTALLED) ## Table 1 and its figure, in outputs/results, and wheth
 	$(BIN)/python -m experiments.run experiment=table1
 	$(BIN)/python -m experiments.run experiment=table1_independent
 	$(BIN)/python -m experiments.results.reproduced table1
+
+results: $(FILES) ## which published results are stale and their CPU hours (RUN="--run [STUDY ...] --shard 1/2": make them)
+	$(BIN)/python -m experiments.cli results $(RUN)
 
 tables: $(INSTALLED) ## everything in results/
 	$(BIN)/python -m experiments.cli tables

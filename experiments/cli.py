@@ -263,6 +263,17 @@ COMMANDS: dict[str, Command] = {
         "experiments.results.published.regenerate",
         {"results": _of("FOLDER", "of results", nargs="?", default="results")},
     ),
+    "results": Command(
+        "which published results are stale; with --run, make them anew",
+        "volumes --run --shard 1/2",
+        "experiments.results.renewal.run_results",
+        {
+            "studies": _of("STUDY", "of those listed; none: all", nargs="*", type=str),
+            "--run": {"action": "store_true", "help": "make what is missing or stale"},
+            "--shard": _of("K/N", "only every N-th job, from the K-th on", default="1/1", type=str),
+            "--results": _of("FOLDER", "of results", default="results"),
+        },
+    ),
     "table": Command(
         "all estimates of a folder as one table for statistics",
         "outputs estimates.csv",

@@ -26,13 +26,29 @@ THREAD_VARIABLES = (
 )  # fmt: skip
 """Environment variables that limit the threads of the numerical libraries."""
 
+NUMBERS = {"twin": 1, "case": 1, "patient": 1, "volume": 1}
+"""Kind of golden run -> generation of its numbers. A result of an earlier generation is stale.
+
+Raise a kind whenever the golden numbers of its runs change (``tests/test_golden.py``): *twin* for
+the default valve, *case* for a case folder, *patient* for virtual patients, *volume* for an image.
+Generation 1 is the default valve of three scallops with branching chordae.
+"""
+
+GOLDEN = {
+    "twin": "0bc2aafe3db3",
+    "case": "e3c60afb707d",
+    "patient": "1994aae37dac",
+    "volume": "13382c6ee359",
+}
+"""Kind of golden run -> digest of its golden numbers at the present generation."""
+
 
 def provenance(directory: Path | None = None) -> dict[str, Any]:
     """Describe the code and the machine of a computation.
 
     Returns a dict: ``git`` (see `git_state`), ``versions`` of packages and ``threads`` by
-    environment variable (None if not installed or unset), ``python``, ``platform``, ``machine`` and
-    ``cpu_count``.
+    environment variable (None if not installed or unset), the generations of ``numbers`` (see
+    `NUMBERS`), ``python``, ``platform``, ``machine`` and ``cpu_count``.
 
     ``directory``: a folder of the checkout; by default that of this file.
     """
@@ -44,6 +60,7 @@ def provenance(directory: Path | None = None) -> dict[str, Any]:
         "git": git_state(directory or Path(__file__).resolve().parent),
         "versions": versions,
         "threads": {name: os.environ.get(name) for name in THREAD_VARIABLES},
+        "numbers": dict(NUMBERS),
         "python": platform.python_version(),
         "platform": platform.platform(),
         "machine": platform.machine(),

@@ -7,10 +7,14 @@ A number may differ by `TOLERANCE` of its size, or of its standard deviation whe
 
     python -m tests.test_golden [NAME ...]
 
+Results published before such a change are stale: `mvest.provenance.NUMBERS` counts the changes of
+each kind of run, and `mvest.provenance.GOLDEN` holds the digest that tells them.
+
 The runs named ``*_coarse`` take seconds on coarse meshes, without relinearising. They guard the
 same code as the full ones, which are ``slow``.
 """
 
+import hashlib
 import json
 import os
 import subprocess
@@ -22,8 +26,11 @@ from pathlib import Path
 import pytest
 
 from experiments.common.records.record import read_record
+from experiments.common.study import load_study, study_names
 from experiments.sweeps.collected import read_sweep
 from mvest.problem.record import EstimateRecord
+from mvest.provenance import GOLDEN as DIGESTS
+from mvest.provenance import NUMBERS
 from tests.places import ROOT
 
 GOLDEN = Path(__file__).with_name("golden.json")
@@ -60,6 +67,7 @@ def read_values(outputs: Path) -> Values:
 class Run:
     """One command; ``slow`` where it takes more than about 15 seconds of CPU."""
 
+    kind: str  # in `NUMBERS`
     overrides: tuple[str, ...]
     slow: bool = False
 
@@ -98,20 +106,23 @@ OWN = ("experiment=own_valve", "case=examples/case")
 STRUCTURED = "personal.mesh.source=structured"
 
 RUNS = {
-    "table1": Run(("experiment=table1",)),
-    "table1_independent": Run(("experiment=table1_independent",), slow=True),
+    "table1": Run("twin", ("experiment=table1",)),
+    "table1_independent": Run("twin", ("experiment=table1_independent",), slow=True),
     "sweep": Run(
-        ("sweep=debug", "filter.initial=[5,3],[4,2]", "seed=1,2,3,4", "observation.noise_mm=0.05")
+        "twin",
+        ("sweep=debug", "filter.initial=[5,3],[4,2]", "seed=1,2,3,4", "observation.noise_mm=0.05"),
     ),
-    "own_valve_coarse": Run((*OWN, "personal=carried", *COARSE)),
-    "own_valve": Run((*OWN, STRUCTURED), slow=True),
-    "patients_coarse": Run((*PATIENT, "personal=nuisances", *SMALL_PATIENT, *COARSE)),
-    "patients": Run(PATIENT, slow=True),
+    "own_valve_coarse": Run("case", (*OWN, "personal=carried", *COARSE)),
+    "own_valve": Run("case", (*OWN, STRUCTURED), slow=True),
+    "patients_coarse": Run("patient", (*PATIENT, "personal=nuisances", *SMALL_PATIENT, *COARSE)),
+    "patients": Run("patient", PATIENT, slow=True),
     "population": Run(
-        ("experiment=population", "patient=drawn", "seed=601", "hydra.mode=RUN"), slow=True
+        "patient",
+        ("experiment=population", "patient=drawn", "seed=601", "hydra.mode=RUN"),
+        slow=True,
     ),
-    "volume_coarse": Run((*VOLUME, *COARSE, *FEWER)),
-    "volume": Run(VOLUME, slow=True),
+    "volume_coarse": Run("volume", (*VOLUME, *COARSE, *FEWER)),
+    "volume": Run("volume", VOLUME, slow=True),
 }
 
 
@@ -155,6 +166,30 @@ def test_estimates_are_what_they_were(name, tmp_path):
     assert golden["command"] == RUNS[name].command, "renew golden.json"
     found = differences(run(name, tmp_path), golden["values"])
     assert not found, "\n".join([f"not as at {golden['commit'][:7]}:", *found])
+
+
+def digest(kind: str, golden: dict) -> str:
+    """Twelve digits that change with the golden numbers of a kind of run, not with its command."""
+    values = {name: golden[name]["values"] for name, one in RUNS.items() if one.kind == kind}
+    # Six digits, as many as `TOLERANCE` holds.
+    numbers = json.loads(json.dumps(values), parse_float=lambda text: f"{float(text):.5e}")
+    return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:12]
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+def test_a_change_of_golden_numbers_makes_published_results_stale(kind):
+    found = digest(kind, json.loads(GOLDEN.read_text(encoding="utf-8")))
+    assert found == DIGESTS[kind], (
+        f"the golden numbers of the kind {kind!r} are other ones: in mvest/provenance.py raise "
+        f"NUMBERS[{kind!r}] to {NUMBERS[kind] + 1} and set GOLDEN[{kind!r}] to {found!r}; "
+        "`mvest results` then lists what is stale"
+    )
+
+
+def test_every_study_follows_known_kinds_of_golden_runs():
+    assert {one.kind for one in RUNS.values()} == set(NUMBERS) == set(DIGESTS)
+    for name in study_names():
+        assert set(load_study(name).golden) <= set(NUMBERS) != set(), name
 
 
 def renew(names: list[str]) -> None:

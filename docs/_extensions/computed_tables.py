@@ -1,33 +1,36 @@
 """Directives for tables computed from code, configuration and ``results/``.
 
-``{parameter-table}``, ``{setting-groups}``, ``{setting-ranges}``, ``{sweep-list}`` and
-``{guess-comparison}`` take no options and no content.
+``{parameter-table}``, ``{setting-groups}``, ``{setting-ranges}``, ``{sweep-list}``,
+``{believed-failures}`` and ``{believed-table}`` take no options and no content. The role
+``{result}`` shows one number of the results (see `experiments.results.quoted`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
 
 from docutils import nodes
+from docutils.parsers.rst.states import Inliner
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
-from study_pages import comment_of
 
 from experiments.common.config import Config
 from experiments.common.schema import hints_of
 from experiments.common.study import load_study, study_names
-from experiments.results.published import records_of
+from experiments.results.believed import MODES, believed, missed
+from experiments.results.quoted import quoted
+from experiments.results.renewal import configured
+from mvest.errors import InputError
 from mvest.mechanics.parameters import KINDS
 from mvest.quantities import Within
-from mvest.reporting.skill import GENERIC, skill_table, stated
 
 ROOT = Path(__file__).resolve().parents[2]
 
-LEAFLETS = ("anterior", "posterior")
+RESULTS = ROOT / "results"
 
 NOT_SETTINGS = ("experiment", "sweep", "hydra", "launcher", "imaging")
 """Groups of the configuration described on other pages."""
@@ -102,28 +105,35 @@ def marks_in(kind: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 def sweep_list() -> str:
     """The sweeps with their descriptions."""
     rows = []
-    for path in sorted((ROOT / "conf" / "sweep").glob("*.yaml")):
-        about = comment_of(path.read_text(encoding="utf-8"))
-        page = (ROOT / "docs" / "studies" / f"sweep_{path.stem}.md").is_file()
-        name = f"[`{path.stem}`](studies/sweep_{path.stem}.md)" if page else f"`{path.stem}`"
-        rows.append([name, about])
+    for one in configured(ROOT / "conf" / "sweep"):
+        page = (ROOT / "docs" / "studies" / f"{one.name}.md").is_file()
+        name = f"[`{one.stem}`](studies/{one.name}.md)" if page else f"`{one.stem}`"
+        rows.append([name, one.about])
     return markdown(["sweep", "question"], rows)
 
 
-def guess_comparison() -> str:
-    """Median errors of estimates and of the generic moduli as a guess."""
-    rows = []
-    for title, name in (("known geometry", "population"), ("simulated volumes", "volume")):
-        kept = records_of(ROOT / "results", name)
-        assert kept is not None
-        estimates = [record.estimates[0] for record in kept.records.values()]
-        moduli = [own for one in estimates for own in stated(one) if own.is_modulus]
-        groups = {leaflet: [own for own in moduli if own.region == leaflet] for leaflet in LEAFLETS}
-        table = skill_table("leaflet", groups | {"both": moduli})
-        cells = [f"{row['median error']:.1f} / {row[f'{GENERIC}, all']:.1f}" for row in table.rows]
-        rows.append([f"{title}, {len(estimates)} virtual patients", *cells])
-    head = ["median size of the error: estimate / generic guess (%)", *LEAFLETS, "both"]
-    return markdown(head, rows)
+def believed_failures() -> str:
+    """The targets that each mode of use misses, worst first."""
+    found = ((row["mode"], missed(row)) for row in believed(RESULTS).rows)
+    lines = [f"* **{mode}**: {'; '.join(texts)}" for mode, texts in found if texts]
+    return "\n".join(lines) or "All targets are met."
+
+
+def believed_table() -> str:
+    """How good each mode of use is, worst first; stale rows say so."""
+    found, stale = believed(RESULTS), {mode.name for mode in MODES if mode.is_stale(RESULTS)}
+    names = [f"{name} (stale)" if name in stale else name for name in found.values["mode"]]
+    return replace(found, values={**found.values, "mode": names}).markdown()
+
+
+def result(
+    name: str, raw: str, text: str, line: int, inliner: Inliner, *_: Any
+) -> tuple[list[nodes.Node], list[nodes.system_message]]:
+    """A number of the results; a wrong source is an error of the build."""
+    try:
+        return [nodes.Text(quoted(text, RESULTS))], []
+    except InputError as error:
+        return [], [inliner.reporter.error(str(error), line=line)]
 
 
 def directive(table: Callable[[], str]) -> type[SphinxDirective]:
@@ -140,6 +150,14 @@ def directive(table: Callable[[], str]) -> type[SphinxDirective]:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the directives."""
-    for table in (parameter_table, setting_groups, setting_ranges, sweep_list, guess_comparison):
+    app.add_role("result", result)
+    for table in (
+        parameter_table,
+        setting_groups,
+        setting_ranges,
+        sweep_list,
+        believed_failures,
+        believed_table,
+    ):
         app.add_directive(table.__name__.replace("_", "-"), directive(table))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

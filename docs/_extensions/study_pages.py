@@ -14,33 +14,16 @@ from typing import TYPE_CHECKING
 
 import yaml
 
+from experiments.results.renewal import Configured, configured, status_of, without_records
+
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
 ELSEWHERE = ("dashboard",)
 """Pictures shown on other pages."""
 
-EARLIER = (
-    "Results of the default valve and of the anatomies made from it are of the earlier default "
-    "valve, without scallops and with straight chordae, until they are run anew."
-)
-PRESENT = (
-    "table1", "gate", "closure", "tissue", "models", "shells", "strip", "donor", "reference_heart",
-)  # fmt: skip
-"""Pages whose results are of the present default valve, or of no such valve."""
-
 LAST = "Further studies"
 """The group of pages without notes."""
-
-
-@dataclass
-class Experiment:
-    """Description of a file of ``conf/experiment``."""
-
-    name: str
-    title: str
-    about: str
-    command: str
 
 
 @dataclass
@@ -52,50 +35,14 @@ class Page:
     group: str = LAST
     order: int = 1000
     notes: str = ""
-    experiments: list[Experiment] = field(default_factory=list)
+    experiments: list[Configured] = field(default_factory=list)
     tables: list[str] = field(default_factory=list)
     pictures: list[str] = field(default_factory=list)
+    stale: str = ""
 
     def owns(self, stem: str) -> bool:
         """Whether a file of ``results/`` belongs to this page."""
         return stem == self.name or stem.startswith(f"{self.name}_")
-
-
-def comment_of(text: str) -> str:
-    """The leading comment of a configuration file."""
-    lines = text.splitlines()
-    while lines and lines[0].startswith("# @"):
-        lines.pop(0)
-    kept: list[str] = []
-    for line in lines:
-        if not line.startswith("#"):
-            break
-        kept.append(line[1:].strip())
-    return " ".join(kept)
-
-
-def read_experiments(folder: Path) -> dict[str, list[Experiment]]:
-    """Experiments or sweeps by their table, own or inherited."""
-    contents = {
-        path.stem: (yaml.safe_load(text), text)
-        for path in sorted(folder.glob("*.yaml"))
-        for text in [path.read_text(encoding="utf-8")]
-    }
-
-    def inherited(name: str, key: str) -> str:
-        data = contents[name][0]
-        if key in data:
-            return str(data[key])
-        bases = [b for b in data.get("defaults", []) if isinstance(b, str) and b in contents]
-        return inherited(bases[0], key) if bases else ""
-
-    found: dict[str, list[Experiment]] = {}
-    for name, (data, text) in contents.items():
-        many = "-m " if data.get("hydra", {}).get("mode") == "MULTIRUN" else ""
-        command = f"mvest run {many}{folder.name}={name}"
-        made = Experiment(name, inherited(name, "title"), comment_of(text), command)
-        found.setdefault(inherited(name, "table") or name, []).append(made)
-    return found
 
 
 def read_notes(folder: Path) -> list[Page]:
@@ -122,8 +69,12 @@ def all_pages(root: Path) -> list[Page]:
     tables = sorted(path.stem for path in results.glob("*.md"))
     pictures = sorted(path.stem for path in results.glob("*.png") if path.stem not in ELSEWHERE)
     pages = read_notes(root / "docs" / "study_notes")
-    conf = root / "conf"
-    experiments = read_experiments(conf / "sweep") | read_experiments(conf / "experiment")
+    experiments: dict[str, list[Configured]] = {}
+    for group in ("experiment", "sweep"):
+        known = set(experiments)
+        for one in configured(root / "conf" / group):
+            if one.table not in known:
+                experiments.setdefault(one.table, []).append(one)
 
     def page_of(stem: str) -> Page | None:
         owners = [page for page in pages if page.owns(stem)]
@@ -143,7 +94,9 @@ def all_pages(root: Path) -> list[Page]:
         if (page := page_of(stem)) is not None:
             page.pictures.append(stem)
     for page in pages:
-        page.title = page.title or (page.experiments[0].title if page.experiments else page.name)
+        first = page.experiments[0].values.get("title") if page.experiments else None
+        page.title = page.title or str(first or page.name)
+        page.stale = stale_text(page, results)
     return sorted(pages, key=lambda page: (page.order, page.title))
 
 
@@ -169,13 +122,25 @@ def text_of(page: Page, results: Path) -> str:
         rows = [f"    {experiment.command}" for experiment in page.experiments]
         parts += ["## Run it", "\n".join(rows)]
     parts.append("## Results")
-    if page.name not in PRESENT:
-        parts.append(EARLIER)
+    parts += [page.stale] if page.stale else []
     tables = [(results / f"{stem}.md") for stem in page.tables]
     shown = {found[2] for path in tables for found in PICTURE.finditer(path.read_text("utf-8"))}
     parts += [picture_text(stem) for stem in page.pictures if stem not in shown]
     parts += [table_text(path) for path in tables]
     return "\n\n".join(parts) + "\n"
+
+
+def stale_text(page: Page, results: Path) -> str:
+    """What a page says if its results are not of today's code and configuration."""
+    if without_records(results).get(page.name):
+        return "**Stale**: the golden numbers that these results follow have changed since."
+    published = [one for one in page.experiments if one.values.get("publish")]
+    found = [one for one in (status_of(each, results) for each in published) if one.text]
+    if not found:
+        return ""
+    command = f"mvest results {' '.join(one.of.name for one in found)} --run"
+    word = "Stale" if any(one.stale for one in found) else "Incomplete"
+    return f"**{word}**: {', '.join(one.text for one in found)}. Renew with `{command}`."
 
 
 def picture_text(stem: str, caption: str = "") -> str:
@@ -199,12 +164,20 @@ def index_of(pages: list[Page]) -> str:
         "Each page has the question of a study, the command that repeats it, and its tables and "
         "figures from `results/`, with commit and configuration. Everything is simulated, except "
         "the donor valve and the shape of the reference heart.",
-        EARLIER,
     ]
+    if stale := sum(bool(page.stale) for page in pages):
+        parts.append(
+            f"Results of {stale} of {len(pages)} pages are stale or incomplete, by the code and "
+            "configuration of today; these are marked."
+        )
     for group in dict.fromkeys(page.group for page in pages):
         members = [page for page in pages if page.group == group]
         names = "\n".join(f"{page.title} <{page.name}>" for page in members)
-        lines = [f"* [{page.title}]({page.name}.md). {question_of(page)}" for page in members]
+        lines = [
+            f"* [{page.title}]({page.name}.md). {question_of(page)}"
+            + (" *Stale.*" if page.stale else "")
+            for page in members
+        ]
         parts.append(f"## {group}\n\n" + "\n".join(lines))
         parts.append(f"```{{toctree}}\n:hidden:\n:caption: {group}\n\n{names}\n```")
     return "\n\n".join(parts) + "\n"

@@ -17,6 +17,7 @@ import experiments.studies
 from experiments.common.records.record import Record
 from experiments.common.records.record import Result as Result
 from mvest.errors import ConfigurationError
+from mvest.provenance import NUMBERS
 from mvest.reporting.tables import Table, joined
 
 if TYPE_CHECKING:
@@ -97,6 +98,8 @@ class Study(Generic[S]):
     check: Callable[[Mapping[str, Any], Path], str] | None = None
     # Raises a `ConfigurationError` for settings that no job could run with.
     require: Callable[[Mapping[str, Any]], None] = lambda values: None
+    # Kinds of golden runs whose numbers change if those of this study do (see `NUMBERS`).
+    golden: tuple[str, ...] = tuple(NUMBERS)
 
 
 def study_names() -> tuple[str, ...]:
@@ -117,3 +120,9 @@ def load_study(name: str) -> Study[Any]:
     study = import_module(module if (STUDIES / f"{name}.py").is_file() else f"{module}.study").STUDY
     assert isinstance(study, Study)
     return study
+
+
+def is_present(record: Record) -> bool:
+    """Whether the numbers that a record's study follows have not changed since."""
+    known, kinds = record.provenance.numbers, load_study(record.study).golden
+    return all(known.get(kind, 0) == NUMBERS[kind] for kind in kinds)

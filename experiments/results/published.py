@@ -125,6 +125,20 @@ def publish(
         raise cannot_write(place, error) from error
 
 
+def unpublish(study: Study[Any], results: Path, table: str, names: Iterable[str]) -> None:
+    """Remove records of a table, and write again what follows from the others."""
+    gone = set(names)
+    if not gone:
+        return
+    with FileLock(results / f".{table}.lock"):
+        records = records_of(results, table).records
+        left = {name: record for name, record in records.items() if name not in gone}
+        for name in gone:
+            _arrays(results, table, name).unlink(missing_ok=True)
+        write_records(results, table, left)
+        write_results(results, study, records_of(results, table))
+
+
 def regenerate(results: Path) -> list[Path]:
     """Write every table, figure and page of published records and sweeps again.
 
@@ -137,13 +151,15 @@ def regenerate(results: Path) -> list[Path]:
             f"{results / RECORDS} holds no record; run an experiment first, for example "
             "mvest run experiment=table1"
         )
+    from experiments.results.quoted import requote
+
     written: list[Path] = []
     for path in paths:
         found = records_of(results, path.stem)
         written += write_results(results, load_study(found.first.study), found)
     for sweep in sweeps:
         written += write_sweep(results, sweep)
-    return written
+    return [*written, *requote(results.resolve().parent / "README.md", results)]
 
 
 def records_of(results: Path, table: str) -> Results:

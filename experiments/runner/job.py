@@ -165,6 +165,12 @@ def answer(request: Request, memory_gb: float) -> dict[str, Any]:
     try:
         compute(request, memory_gb)
     except Exception as error:
+        # Compiled code reports an interruption as an error of its own, perhaps twice.
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, KeyboardInterrupt):
+                raise cause from None
+            cause = cause.__cause__
         # Any error costs only its own job; the traceback is in the log.
         traceback.print_exception(error, file=sys.stdout)
         reason = one_line(message_of(error))

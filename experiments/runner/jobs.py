@@ -21,7 +21,7 @@ from filelock import AcquireReturnProxy, FileLock, Timeout
 
 from experiments.common.config import require_in_range, without_places
 from experiments.common.records.record import Record, adopt_arrays, read_record, stamp, write_record
-from experiments.common.study import Result
+from experiments.common.study import Result, is_present
 from mvest.errors import InputError, message_of
 from mvest.files import remove_parts, require_writable, sha256_of, write_atomically
 from mvest.provenance import write_json
@@ -88,7 +88,9 @@ def mark_done(folder: Path) -> None:
 
 
 def last_record(folder: Path, config_hash: str, *, cut_off: bool = False) -> Record | None:
-    """The record of the last attempt; None if there is none of this version and configuration.
+    """The record of the last attempt; None if there is none of this configuration and version.
+
+    The numbers of a version are those of `mvest.provenance.NUMBERS`.
 
     It is a failure, or a success that is done; with ``cut_off`` it is a success that is not done,
     because a file that follows from it could not be written.
@@ -97,7 +99,7 @@ def last_record(folder: Path, config_hash: str, *, cut_off: bool = False) -> Rec
         record = read_record(folder / RESULT)
     except InputError:
         return None
-    matches = record.provenance.config_hash == config_hash
+    matches = record.provenance.config_hash == config_hash and is_present(record)
     return record if matches and cut_off == (record.converged > is_done(folder)) else None
 
 

@@ -94,7 +94,7 @@ def launch(
         print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
         print(f"`mvest collect {plan.folder}` collects and logs their results")
         return [], jobs
-    ended = _run(plan, batch, settings)
+    ended = _run(plan, batch.to_run, settings)
     found = {job.hash: job.record for job in finish(plan, ended).jobs}
     returned = []
     for job in batch.jobs:
@@ -117,10 +117,33 @@ def launch(
     return returned, jobs
 
 
-def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]:
-    """Run the jobs of a batch that are not done; returns heads of their records, by hash."""
+def run_plan(plan: Plan, jobs: Sequence[Request]) -> Sweep:
+    """Run some jobs of a plan on this machine, and publish all that are done, by anyone.
+
+    Raises an `MvestError` if a setting is inadmissible or a file cannot be written.
+    """
+    for job in jobs:
+        require_admissible(job.values)
+    settings = EngineSettings()
+    require_writable(plan.folder)
+    plan = replace(plan, workers=settings.at_a_time).write()
+    try:
+        ended = _run(plan, jobs, settings)
+    except KeyboardInterrupt:
+        done = earlier(plan.jobs)  # a job that was cut off may have left a failure
+        kept = [
+            job for job in plan.jobs if job.config_hash in done and done[job.config_hash].converged
+        ]
+        _publish_jobs(kept)
+        raise
+    # Others may have finished jobs meanwhile.
+    return finish(plan, {**earlier(plan.jobs), **ended})
+
+
+def _run(plan: Plan, todo: Sequence[Request], settings: EngineSettings) -> dict[str, Record]:
+    """Run jobs that are not done; returns heads of their records, by hash."""
     ended: dict[str, Record] = {}
-    jobs = list({job.config_hash: job for job in batch.to_run}.values())
+    jobs = list({job.config_hash: job for job in todo}.values())
     if not jobs:
         return ended
     ends = run_jobs(jobs, settings, min(plan.workers, len(jobs)), plan.written_ns)
@@ -149,16 +172,22 @@ def run_shard(folder: Path, shard: str) -> int:
 
     Raises an `MvestError` if nothing is planned in the folder, or there is no such shard.
     """
+    take = share_of(shard)
+    plan = Plan.read(folder, look=False)
+    # Counted over all jobs, done or not, so that no two shards share one.
+    jobs = plan.jobs[take]
+    failed = sum(not execute(job, plan.written_ns).converged for job in jobs)
+    print(f"shard {shard}: {len(jobs)} jobs, {failed} without an estimate")
+    return 0
+
+
+def share_of(shard: str) -> slice:
+    """Every N-th from the I-th on, for "I/N"; raises a `ConfigurationError` for any other text."""
     found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", shard)
     first, step = map(int, found.groups()) if found else (0, 0)
     if not 1 <= first <= step:
         raise ConfigurationError(f"shard {shard}, expected I/N with I from 1 to N, for example 2/8")
-    plan = Plan.read(folder, look=False)
-    # Counted over all jobs, done or not, so that no two shards share one.
-    jobs = plan.jobs[first - 1 :: step]
-    failed = sum(not execute(job, plan.written_ns).converged for job in jobs)
-    print(f"shard {shard}: {len(jobs)} jobs, {failed} without an estimate")
-    return 0
+    return slice(first - 1, None, step)
 
 
 def collect_sweep(folder: Path) -> int:
@@ -180,6 +209,16 @@ def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
         if path.suffix in (".md", ".png"):
             print(f"Written to {path}")
     write_atomically(plan.folder / TABLE, sweep_table(found).to_parquet())
+    _publish_jobs(plan.jobs)
+    results = plan.common["paths"]["results"]
+    if plan.publish and all(one.reason != NOT_RUN for one in found.records):
+        publish_sweep(Path(results), found)
+    elif plan.publish is False:
+        print(f"{results} left as it is: this sweep has overrides")
+    return found
+
+
+def _publish_jobs(jobs: Sequence[Request]) -> None:
     publish_runs(
         (
             job.publish_as,
@@ -187,15 +226,9 @@ def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
             job.folder,
             Path(job.values["paths"]["results"]),
         )
-        for job in plan.jobs
+        for job in jobs
         if job.publish_as
     )
-    results = plan.common["paths"]["results"]
-    if plan.publish and all(one.reason != NOT_RUN for one in found.records):
-        publish_sweep(Path(results), found)
-    elif plan.publish is False:
-        print(f"{results} left as it is: this sweep has overrides")
-    return found
 
 
 def collected(plan: Plan, ended: Mapping[str, Record]) -> Sweep:

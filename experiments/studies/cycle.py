@@ -272,4 +272,5 @@ STUDY = Study(
     },
     keeps_failures=True,
     check=expect_cycle,
+    golden=("twin",),
 )

@@ -344,4 +344,4 @@ def summary(results: Results) -> dict[str, Table]:
     return shown
 
 
-STUDY = Study(settings=Settings, run=run, summary=summary)
+STUDY = Study(settings=Settings, run=run, summary=summary, golden=("twin", "patient"))

@@ -269,4 +269,5 @@ STUDY = Study(
     figure=figure,
     captions={"": "Parameters after each iteration, with each model."},
     check=check_external,
+    golden=("case",),
 )

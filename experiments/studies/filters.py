@@ -259,4 +259,5 @@ STUDY = Study(
         "": "95 % interval that each filter gives each unknown, on that of draws from the "
         "posterior: blue where it is as wide to 10 %. Simulated."
     },
+    golden=("twin",),
 )

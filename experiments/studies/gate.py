@@ -190,4 +190,5 @@ STUDY = Study(
     figure=figure,
     captions={"": "A valve closing. Simulated."},
     keeps_failures=True,
+    golden=("twin",),
 )

@@ -321,4 +321,5 @@ STUDY = Study(
     files=write_report,
     keep=short,
     keeps_failures=True,
+    golden=("patient", "volume"),
 )

@@ -375,4 +375,5 @@ STUDY = Study(
     figure=figure,
     captions={"": "A valve from outside and closures of its model."},
     keeps_failures=True,
+    golden=("case",),
 )

@@ -369,4 +369,5 @@ STUDY = Study(
         "atrium, and measures of it with their 95 % intervals. Simulated."
     },
     keep_arrays=lambda record, path: read_npz(path),
+    golden=("patient",),
 )

@@ -139,4 +139,5 @@ STUDY = Study(
     words=case_words,
     keep=short,
     keeps_failures=True,
+    golden=("case", "patient"),
 )

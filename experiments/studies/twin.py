@@ -233,4 +233,5 @@ STUDY = Study(
     check=expect_twin,
     require=require_twin,
     keeps_failures=True,
+    golden=("twin",),
 )

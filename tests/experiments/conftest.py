@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 
 from experiments.common.records.record import read_record
 from tests.experiments.composed_once import composed_once
@@ -21,6 +22,7 @@ def no_heartbeat(monkeypatch):
 def no_hydra_left_over():
     yield
     GlobalHydra.instance().clear()
+    HydraConfig.instance().cfg = None
 
 
 @pytest.fixture

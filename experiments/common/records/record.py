@@ -48,6 +48,8 @@ class Provenance(Frozen):
     git: GitState
     versions: Mapping[str, str | None]
     threads: Mapping[str, str | None]  # environment variables that cap threads, and their values
+    # Kind of golden run -> generation of the numbers; a kind without an entry is of generation 0.
+    numbers: Mapping[str, int] = {}
     python: str
     platform: str
     machine: str

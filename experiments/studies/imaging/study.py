@@ -369,4 +369,5 @@ STUDY = Study(
         "without a valve. Simulated."
     },
     require=require_imaging,
+    golden=("patient", "volume"),
 )

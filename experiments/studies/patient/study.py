@@ -417,4 +417,5 @@ STUDY = Study(
     keep_arrays=keep_arrays,
     keeps_failures=True,
     check=check_patient,
+    golden=("patient",),
 )

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.runner import job
 from experiments.runner.tracking import opened, runs_of
 from experiments.sweeps.collected import read_sweep
 from tests.places import ROOT
@@ -85,3 +86,20 @@ def test_a_signal_leaves_nothing_behind(stage, signals, more, tmp_path):
         with opened(None, tmp_path / "outputs", "sweep_debug"):
             runs = runs_of("sweep_debug", "")
         assert [run.info.status for run in runs] == ["FINISHED"] * 5, "four jobs and the sweep"
+
+
+def test_an_interruption_within_compiled_code_is_no_failure_of_the_job(monkeypatch):
+    def compiled(*_):
+        try:
+            try:
+                raise KeyboardInterrupt
+            except KeyboardInterrupt as stopped:
+                raise SystemError(
+                    "a dispatcher returned a result with an exception set"
+                ) from stopped
+        except SystemError as wrapped:
+            raise SystemError("the same, one call further out") from wrapped
+
+    monkeypatch.setattr(job, "compute", compiled)
+    with pytest.raises(KeyboardInterrupt):
+        job.answer(None, 1.0)
