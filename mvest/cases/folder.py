@@ -91,7 +91,7 @@ def read_case(path: Path | str) -> ValveCase:
     surface = read_leaflets(folder, reference)
     chordae = read_chordae(folder, reference, placed)
     uncertainty, samples = _observation(folder, first)
-    entry = document.chordae
+    entry, arrival = document.chordae, document.arrival
     case = ValveCase(
         **{name: getattr(document, name) for name in TEXTS},
         surface=surface,
@@ -104,7 +104,7 @@ def read_case(path: Path | str) -> ValveCase:
         sha256=folder.sha256(),
         error_samples=samples,
         chordae_follow=entry is None or entry.follow,
-        arrival=document.arrival and Arrival(**document.arrival.model_dump()),
+        arrival=None if arrival is None else Arrival(arrival.way, arrival.made_by),
     )
     if entry is not None:
         with folder.at("chordae"):

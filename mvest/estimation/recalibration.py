@@ -129,19 +129,15 @@ def recalibrate(
         return float(fit + n * np.sum(log_spread) + prior)
 
     found = np.asarray(minimize(objective, np.zeros(q), method="BFGS").x)
-    steps = STEP * np.eye(q)
-    curvature = [
-        [
-            sum(s * r * objective(found + s * a + r * b) for s in (1, -1) for r in (1, -1))
-            for a in steps
-        ]
-        for b in steps
-    ]
+    steps, signs = STEP * np.eye(q), (1.0, -1.0)
+    curvature = np.zeros((q, q))
+    for i, j in np.ndindex(q, q):
+        corners = [(s * r, found + s * steps[i] + r * steps[j]) for s in signs for r in signs]
+        curvature[i, j] = sum(sign * objective(at) for sign, at in corners) / (2.0 * STEP) ** 2
     A, b, _ = regression(found)
     offset, slope = np.split(believed + np.linalg.solve(A, b), 2)
-    return Recalibration(
-        offset, slope, np.linalg.inv(A), found, np.linalg.inv(np.array(curvature) / (2 * STEP) ** 2)
-    )
+    C, D = (np.asarray(np.linalg.inv(each), dtype=np.float64) for each in (A, curvature))
+    return Recalibration(offset, slope, C, found, D)
 
 
 def left_out(
@@ -153,8 +149,9 @@ def left_out(
     """
     pairs = []
     for k in range(len(x)):
-        others = (np.delete(each, k, axis=0) for each in (x, V, truth))
-        pairs.append(recalibrate(*others, beliefs).predicted(x[k], V[k]))
+        others = np.arange(len(x)) != k
+        learned = recalibrate(x[others], V[others], truth[others], beliefs)
+        pairs.append(learned.predicted(x[k], V[k]))
     means, covariances = zip(*pairs, strict=True)
     return np.array(means), np.array(covariances)
 

@@ -35,7 +35,7 @@ from mvest.reading.documents import read_mapping, validated
 from mvest.typing import FloatArray
 
 CALIBRATIONS = Path(__file__).with_name("calibrations")
-"""Folder of the package's calibrations, one file ``WAY.json`` for each `mvest.cases.case.Arrival.way`."""
+"""Folder of the package's calibrations, ``WAY.json`` for a `mvest.cases.case.Arrival.way`."""
 
 MIN_PATIENTS = 10
 
@@ -183,9 +183,9 @@ class FoundCalibration:
         at = [k for k, name in enumerate(names) if name.startswith("E_f.")]
         used = self.calibration
         return {
-            **self.case.model_dump(),
+            "measured_for": self.case.model_dump(),
             "patients": 0 if used is None else used.patients,
-            "why": self.why,
+            "why": "" if self.stale else self.why,  # else the verdict says it
             "parameters": [names[k] for k in at],
             "log_estimate": (after.mean - prior.mean)[at].tolist(),
             "log_covariance": after.covariance[np.ix_(at, at)].tolist(),
@@ -234,30 +234,21 @@ def pairs_of(estimates: Sequence[EstimateRecord]) -> Pairs:
     """
     kept = tuple(one for one in estimates if one.is_stated)
     if len(kept) < MIN_PATIENTS:
-        raise InputError(
-            f"{len(kept)} estimates to calibrate with, expected {MIN_PATIENTS} or more"
-        )
+        raise InputError(f"{len(kept)} estimates that may be stated, expected {MIN_PATIENTS}")
     rows, truths = [], []
     for one in kept:
-        (row,) = one.detail_rows("calibration") or ({},)
-        moduli = [one.unknown(name) for name in row.get("parameters", ())]
-        if not moduli or any(own.truth is None for own in moduli):
-            raise InputError(
-                f"estimate of {one.case}: expected its calibration's row and its truth"
-            )
+        (row,) = one.detail_rows("calibration") or ({"parameters": ()},)
+        known = {own.name: (own.truth, own.prior_mean) for own in one.moduli}
+        pairs = np.array([known[name] for name in row["parameters"]], dtype=np.float64)
+        if not (len(pairs) and (pairs > 0.0).all()):
+            raise InputError(f"estimate of {one.case}: no detail calibration, or no true moduli")
         rows.append(row)
-        truths.append(
-            [np.log(float(own.truth or 0) / float(own.prior_mean or 0)) for own in moduli]
-        )
-        if fault := measured(rows[0]).fault(measured(row)):
+        truths.append(np.log(pairs[:, 0] / pairs[:, 1]))
+        first, own = (MeasuredFor(**each["measured_for"]) for each in (rows[0], row))
+        if fault := first.fault(own):
             raise InputError(f"estimates of {kept[0].case} and {one.case}: {fault}")
     x, V = (np.array([row[key] for row in rows]) for key in ("log_estimate", "log_covariance"))
     return Pairs(kept, rows[0], x, V, np.array(truths))
-
-
-def measured(row: Row) -> MeasuredFor:
-    """What the estimate was made with whose detail ``calibration`` is this row."""
-    return MeasuredFor(**{name: row[name] for name in MeasuredFor.model_fields})
 
 
 def calibrate(
@@ -270,7 +261,7 @@ def calibrate(
     pairs = pairs_of(estimates)
     found = asdict(recalibrate(pairs.x, pairs.V, pairs.truth))
     return Calibration(
-        measured_for=measured(pairs.row),
+        measured_for=MeasuredFor(**pairs.row["measured_for"]),
         parameters=tuple(pairs.row["parameters"]),
         simulated=len(estimates),
         patients=len(pairs.estimates),

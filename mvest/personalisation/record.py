@@ -25,9 +25,8 @@ measurements   frame, shape (observed, generic or personalised), and one column 
 physiology     columns of `mvest.closure.physiology.Row`: the closed valve at the estimate
 resistance     part, of, and one column (%) for each of `mvest.mechanics.resistance.WAYS`: by which
                tissue it resists, and where the information on the moduli comes from
-calibration    (one row) way, made_by, settings: `mvest.personalisation.calibration.MeasuredFor`;
-               patients (0: not calibrated), why not; parameters, log_estimate, log_covariance:
-               uncalibrated, `mvest.personalisation.calibration.FoundCalibration.row`
+calibration    (one row) measured_for, patients (0: not calibrated), why not; parameters,
+               log_estimate and log_covariance before: `FoundCalibration.row`
 image_step     with image_frames and pictures: `DetectedValve.details`
 ============== ==================================================================================
 """
@@ -46,7 +45,16 @@ from mvest.personalisation.known import data_alone, derived_quantities
 from mvest.personalisation.result import Personalised
 from mvest.problem.estimate import StudyResult
 from mvest.problem.fields import as_stored, chord_fields
-from mvest.problem.record import EstimateRecord, FrameFit, Numbers, Row, Spread, finite, record_of
+from mvest.problem.record import (
+    UNCALIBRATED,
+    EstimateRecord,
+    FrameFit,
+    Numbers,
+    Row,
+    Spread,
+    finite,
+    record_of,
+)
 from mvest.problem.verdict import judge
 from mvest.valve.measure.clinical import clinical_measurements
 
@@ -71,7 +79,7 @@ def record_of_case(
     details = {**_details(fit), "calibration": _calibration(plain), **fit.details, **images}
     others, before = dict(fit.alternatives), _record(plain, plain.result)
     if fit is not plain:
-        others["uncalibrated"] = plain.result
+        others[UNCALIBRATED] = plain.result
     return _record(fit, fit.result).model_copy(
         update={
             "iterates": before.iterates,
