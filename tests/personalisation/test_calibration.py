@@ -23,12 +23,11 @@ from mvest.personalisation.calibration import (
 )
 from mvest.personalisation.record import record_of_case
 from mvest.personalisation.settings import PACKAGE
-from mvest.problem.record import UNCALIBRATED, EstimateRecord, Unknown
+from mvest.problem.record import UNCALIBRATED, EstimateRecord
 from mvest.problem.verdict import DOUBTFUL
+from tests.calibrated_patients import MODULI, PRIOR, patients
 from tests.made_up_closure import MECHANICS, made_up_case, settings, use
 
-MODULI = ("E_f.anterior", "E_f.posterior")
-PRIOR = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
 OFFSET, SLOPE, SPREAD = (0.05, 0.2), (0.9, 1.2), (1.5, 0.8)
 
 
@@ -245,34 +244,6 @@ def test_a_case_says_by_which_way_its_geometry_arrived(tmp_path, fit):
     (place / "case.yaml").write_text(text.replace("way: volume", "way: dream"))
     with pytest.raises(InputError, match=r"arrival\.way: found 'dream'; expected volume"):
         read_case(place)
-
-
-def patients(rng, n, measured_for, offset=(0.0, 0.25)):
-    """Records of estimates whose truth is higher by an offset of the logarithm."""
-    for seed in range(n):
-        V = np.array([[0.04, 0.015], [0.015, 0.03]])
-        x = 0.4 * rng.standard_normal(2)
-        truth = x + np.array(offset) + rng.multivariate_normal([0, 0], V)
-        moduli = tuple(
-            Unknown(name=name, prior_mean=PRIOR[name], truth=PRIOR[name] * np.exp(t), estimate=1.0)
-            for name, t in zip(MODULI, truth, strict=True)
-        )
-        about = {
-            "measured_for": measured_for.model_dump(),
-            "patients": 0,
-            "why": "",
-            "parameters": MODULI,
-            "log_estimate": x.tolist(),
-            "log_covariance": V.tolist(),
-        }
-        yield EstimateRecord(
-            case=f"patient_{seed}",
-            seed=seed,
-            status="converged",
-            reason="",
-            unknowns=moduli,
-            details={"calibration": (about,)},
-        )
 
 
 def test_records_of_patients_make_a_calibration(measured_for):

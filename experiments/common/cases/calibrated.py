@@ -23,6 +23,7 @@ from mvest.typing import FloatArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+TICKS = (0.3, 0.5, 1.0, 2.0, 3.0)
 BEFORE, AFTER = UNCALIBRATED, "calibrated"
 
 
@@ -39,13 +40,13 @@ def before_and_after(estimates: Sequence[EstimateRecord]) -> dict[str, list[Unkn
     own = pairs.estimates[0].moduli
     prior = np.array([float(m.prior_std or 0) / float(m.prior_mean or 1) for m in own])
 
-    def along(d: FloatArray, means: FloatArray, covariances: FloatArray) -> list[Unknown]:
-        kind = "modulus" if np.sum(d) else "quantity"
+    def along(name: str, means: FloatArray, covariances: FloatArray) -> list[Unknown]:
+        d = directions[name]
         stds = np.sqrt(np.einsum("i,nij,j->n", d, covariances, d))
         return [
             Unknown(
-                name="E_f",
-                kind=kind,  # type: ignore[arg-type]
+                name=f"E_f.{name}",
+                kind="modulus" if name in names else "quantity",
                 prior_mean=1.0,
                 prior_std=float(np.linalg.norm(d * prior)),
                 estimate=float(np.exp(mean)),
@@ -58,7 +59,7 @@ def before_and_after(estimates: Sequence[EstimateRecord]) -> dict[str, list[Unkn
         ]
 
     found = {BEFORE: (pairs.x, pairs.V), AFTER: left_out(pairs.x, pairs.V, pairs.truth)}
-    return {f"{when}, {k}": along(d, *found[when]) for k, d in directions.items() for when in found}
+    return {f"{when}, {name}": along(name, *found[when]) for name in directions for when in found}
 
 
 def calibration_tables(estimates: Sequence[EstimateRecord]) -> dict[str, Table]:
@@ -126,9 +127,12 @@ def calibration_figure(estimates: Sequence[EstimateRecord]) -> dict[str, Figure]
             x, truth = ([getattr(one, key) for one in own] for key in ("estimate", "truth"))
             axes.plot(x, truth, marker, color=colour, ms=4, ls="", label=when)
         axes.axline((1.0, 1.0), (2.0, 2.0), color="0.3", lw=0.8)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel(f"E_f {name}, estimate / prior mean")
+        axes.set(xscale="log", yscale="log")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_ticks(TICKS, labels=[f"{tick:g}" for tick in TICKS])
+        axes.minorticks_off()
+        axes.set_title(f"E_f {name}", fontsize=9)
+        axes.set_xlabel("estimate / prior mean")
     grid[0].set_ylabel("truth / prior mean")
     grid[0].legend(fontsize=8, frameon=False)
     return {"": drawn}
