@@ -9,17 +9,24 @@ patients again (``experiment=volumes_calibration``) and ship what they give::
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from experiments.common.cases.own_case import PersonalSettings, settings_of
+from experiments.common.config import plain
+from experiments.common.schema import build
 from experiments.results.calibrated import calibration_of
 from mvest.imaging.detection.trained_model import default_model
 from mvest.personalisation.calibration import (
     CALIBRATIONS,
     Calibration,
     read_calibration,
+    settings_digest,
     write_calibration,
 )
+from mvest.personalisation.settings import PACKAGE, default_settings
+from tests.experiments.configured import composed
 from tests.places import ROOT
 from tests.test_golden import GOLDEN, TOLERANCE
 
@@ -61,6 +68,17 @@ def test_another_estimate_of_the_example_is_seen() -> None:
     assert changed(known, now) == []
     assert changed(known, now | {"E_f.posterior": [2.0, 0.41]}) == ["E_f.posterior"]
     assert changed(known, now | {"E_f.anterior": [5.00001, 1.0]}) == ["E_f.anterior"]
+
+
+def test_patients_are_estimated_as_volumes_of_users_are() -> None:
+    """Otherwise no volume would have the digest that the calibration is for."""
+    case = SimpleNamespace(error_samples=range(200))
+    used = [default_settings(case)]
+    for name in ("volume", "volumes", "volumes_calibration"):
+        values = plain(composed(f"experiment={name}"))
+        used.append(settings_of(values, build(PersonalSettings, values["personal"])))
+    assert len({settings_digest(case, one) for one in used}) == 1
+    assert [one.calibration for one in used] == [PACKAGE, PACKAGE, PACKAGE, None]
 
 
 def ship() -> None:

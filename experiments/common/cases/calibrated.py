@@ -99,7 +99,8 @@ def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
     """Mean error of the logarithms, and the truths' slope over the estimates: 0 and 1 if right."""
     rows = []
     for name, own in groups.items():
-        found, truth = np.log([[one.estimate, one.truth] for one in own]).T
+        pairs = np.array([(one.estimate, one.truth) for one in own], dtype=np.float64)
+        found, truth = np.log(pairs).T
         line, error = linregress(found, truth), found - truth
         row = {"estimate": name, "n": len(own), "bias": error.mean(), "bias SE": sem(error)}
         rows.append(row | {"slope": line.slope, "slope SE": line.stderr})
