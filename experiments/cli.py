@@ -283,6 +283,16 @@ COMMANDS: dict[str, Command] = {
             "target": _of("FILE", "NAME.csv or NAME.parquet"),
         },
     ),
+    "calibrate": Command(
+        "a calibration of moduli from the records of virtual patients",
+        "results volume_calibration calibration.json",
+        "experiments.results.calibrated.calibrate_command",
+        {
+            "results": _of("FOLDER", "of results"),
+            "table": _of("TABLE", "volume_calibration", type=str),
+            "target": _of("FILE", "to write, for personal.calibration=FILE"),
+        },
+    ),
     "worker": Command(
         "run a share of a planned sweep's jobs, under any scheduler",
         "outputs/sweep_noise --shard 2/8",

@@ -44,7 +44,11 @@ Values = dict[str, dict[str, list[float]]]
 """By run or job, and by unknown: estimate and standard deviation."""
 
 
-ALTERNATIVES = {"moduli_only": "without_nuisances", "paper": "as_in_the_paper"}
+ALTERNATIVES = {
+    "moduli_only": "without_nuisances",
+    "paper": "as_in_the_paper",
+    "uncalibrated": "uncalibrated",
+}
 
 
 def read_values(outputs: Path) -> Values:

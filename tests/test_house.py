@@ -78,7 +78,13 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.exchange": (*CLOSURES, "mvest.provenance", "mvest.imaging"),
     "mvest.exchange.importing": IMPORT_AND_EXPORT,
     "mvest.exchange.exporting": IMPORT_AND_EXPORT,
-    "mvest.personalisation": (*CLOSURES, "mvest.observation", "mvest.problem", "mvest.cases"),
+    "mvest.personalisation": (
+        *CLOSURES,
+        "mvest.provenance",
+        "mvest.observation",
+        "mvest.problem",
+        "mvest.cases",
+    ),
     "mvest.scenarios": CLOSURES,
     "mvest.simulation": (
         *LEAVES,

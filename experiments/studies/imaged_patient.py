@@ -5,15 +5,19 @@ the true geometry (known geometry), and the true geometry with the error of a vo
 segmentation). Errors that remain in these two are not caused by the images.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import linregress, sem
 
 from experiments.common.building.closure import mechanics_of, template_of
+from experiments.common.cases.calibrated import calibration_figure, calibration_tables
 from experiments.common.cases.own_case import (
     ImagedInput,
     PersonalSettings,
@@ -43,7 +47,7 @@ from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.observation.errors import SpatialCorrelation
-from mvest.problem.record import EstimateRecord, Unknown
+from mvest.problem.record import UNCALIBRATED, EstimateRecord, Unknown
 from mvest.problem.stored import entry_of
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
@@ -56,6 +60,9 @@ from mvest.simulation.virtual_patient import PatientSettings, draw_patient_value
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
 """A patient, its imaging, and the number of anatomies drawn for it."""
 
@@ -65,7 +72,12 @@ that process cannot open; the folder that no estimation can open; and the truth 
 
 KNOWN, SEGMENTED = "known", "segmented"
 """Folders of the better geometries, and names of their estimates in a record."""
-SOURCES = {"": "the volume", SEGMENTED: "a perfect segmentation", KNOWN: "the known geometry"}
+SOURCES = {
+    "": "the volume",
+    UNCALIBRATED: "the volume, uncalibrated",
+    SEGMENTED: "a perfect segmentation",
+    KNOWN: "the known geometry",
+}
 
 MAX_DRAWS = 10
 """Largest number of anatomies drawn to find one that closes as a valve."""
@@ -88,6 +100,7 @@ class Settings:
     volume: str | None = None  # written by the study
     imaged: ImagedInput = field(default_factory=ImagedInput)
     personal: PersonalSettings
+    better: tuple[str, ...] = (KNOWN, SEGMENTED)  # geometries to estimate from besides the volume
 
 
 # -- run ------------------------------------------------------------------------------------------
@@ -99,7 +112,7 @@ def run_imaged_patient(job: Job[Settings]) -> Result:
     given = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
     found = estimate_hidden(given, folder, place / VOLUME, place / HIDDEN, personal)
     better = {}
-    for name in (KNOWN, SEGMENTED):
+    for name in job.settings.better:
         (folder / name).mkdir(exist_ok=True)
         case = place / HIDDEN / name
         result = estimate_hidden(values, folder / name, case, place / TRUTH, personal)
@@ -232,7 +245,12 @@ def _segmented(
 
 # -- tables ---------------------------------------------------------------------------------------
 def summary(results: Results) -> dict[str, Table]:
-    """Moduli and truths, the skill and bias of each source, and the lengths of chordae."""
+    """Moduli and truths, the skill and bias of each source, and the lengths of chordae.
+
+    Without better geometries: the calibration of the moduli, and what it does.
+    """
+    if _is_calibration(results):
+        return calibration_tables([one for _, one in revealed(results)])
     groups = _by_source(results)
     skill = unknowns_of(groups) | unknowns_of(groups, by_name=True)
     estimates = [estimate for _, estimate in revealed(results)]
@@ -252,8 +270,19 @@ def _by_source(results: Results, *, verdict_of_volume: bool = False) -> Groups:
         (source, estimate, own if verdict_of_volume else estimate)
         for _, own in revealed(results)
         for name, source in SOURCES.items()
+        if not name or name in own.alternatives
         for estimate in (own.alternatives[name] if name else own,)
     )
+
+
+def _is_calibration(results: Results) -> bool:
+    return not any({KNOWN, SEGMENTED} & one.alternatives.keys() for _, one in revealed(results))
+
+
+def _figures(results: Results) -> dict[str, Figure]:
+    if _is_calibration(results):
+        return calibration_figure([one for _, one in revealed(results)])
+    return {"moduli": groups_figure(_by_source(results, verdict_of_volume=True))}
 
 
 def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
@@ -312,14 +341,16 @@ STUDY = Study(
     settings=Settings,
     run=run_imaged_patient,
     summary=summary,
-    figure=lambda results: {"moduli": groups_figure(_by_source(results, verdict_of_volume=True))},
+    figure=_figures,
     captions={
+        "": "True moduli and their ratio over estimates from volumes, before calibration and after "
+        "it, when each patient is left out. Simulated.",
         "moduli": "Estimates with their 95 % intervals over the truth, in the colour of the "
-        "verdict on the one from the volume. Simulated."
+        "verdict on the one from the volume. Simulated.",
     },
     words=case_words,
     files=write_report,
-    keep=short,
+    keep=partial(short, details=("calibration",)),
     keeps_failures=True,
     golden=("patient", "volume"),
 )

@@ -169,6 +169,14 @@ class ErrorSamples:
         return len(self.vertices)
 
 
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """By which way the geometry of a case arrived."""
+
+    way: str  #: volume, surfaces, labels or vertices
+    made_by: str = ""  #: SHA-256 of what made it of the data, such as detectors
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ValveCase:
     """A valve and its observations."""
@@ -197,6 +205,7 @@ class ValveCase:
     #: Whether chordae are laid out by the shape of the frames, and laid out again for each error
     #: sample. Otherwise they are measured.
     chordae_follow: bool = False
+    arrival: Arrival | None = None  #: None: not stated
 
     def __post_init__(self) -> None:
         check_frames(self.frames, self._wrong)

@@ -5,6 +5,7 @@ errors of all frames are one file of named arrays, NumPy's ``.npz``.
 """
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import yaml
 
 from mvest.cases.band import check_closing_pressure
 from mvest.cases.case import (
+    Arrival,
     ErrorSamples,
     Frame,
     Role,
@@ -89,7 +91,7 @@ def read_case(path: Path | str) -> ValveCase:
     surface = read_leaflets(folder, reference)
     chordae = read_chordae(folder, reference, placed)
     uncertainty, samples = _observation(folder, first)
-    entry = document.chordae
+    entry, arrival = document.chordae, document.arrival
     case = ValveCase(
         **{name: getattr(document, name) for name in TEXTS},
         surface=surface,
@@ -102,6 +104,7 @@ def read_case(path: Path | str) -> ValveCase:
         sha256=folder.sha256(),
         error_samples=samples,
         chordae_follow=entry is None or entry.follow,
+        arrival=None if arrival is None else Arrival(arrival.way, arrival.made_by),
     )
     if entry is not None:
         with folder.at("chordae"):
@@ -192,6 +195,7 @@ def _write_files(folder: Path, case: ValveCase) -> None:
             **({"follow": True} if case.chordae_follow else {}),
         },
         "observation": observation,
+        **({"arrival": asdict(case.arrival)} if case.arrival else {}),
         "derived": list(case.derived),
     }
     write_chordae(folder / "chordae.csv", chordae)

@@ -138,6 +138,15 @@ class ObservationEntry(_Model):
     )
 
 
+class ArrivalEntry(_Model):
+    """By which way the geometry arrived."""
+
+    way: Literal["volume", "surfaces", "labels", "vertices"] = Field(
+        description="volume, surfaces, labels or vertices"
+    )
+    made_by: Text = Field("", description="text: SHA-256 of what made it, such as detectors")
+
+
 class CaseFile(_Model):
     """The content of ``case.yaml``."""
 
@@ -168,6 +177,9 @@ class CaseFile(_Model):
     )
     observation: ObservationEntry | None = Field(
         None, description="a mapping with std_mm, correlation_length_mm and error_samples"
+    )
+    arrival: ArrivalEntry | None = Field(
+        None, description="a mapping with way and made_by, written by the program that made it"
     )
     derived: list[Text] = Field(
         default_factory=list,
@@ -227,6 +239,7 @@ PARTS: Mapping[str | int, type[BaseModel]] = {
     "frames": FrameEntry,
     "chordae": ChordaeEntry,
     "observation": ObservationEntry,
+    "arrival": ArrivalEntry,
     "std_mm": PointData,
 }
 """Fields that are models themselves."""

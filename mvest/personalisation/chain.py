@@ -12,6 +12,7 @@ from mvest.closure.model import ClosureModel
 from mvest.estimation.estimate import OnIterate
 from mvest.estimation.prediction import Prediction
 from mvest.observation.surfaces import surface_distance
+from mvest.personalisation.calibration import calibration_for
 from mvest.personalisation.closed import closed_details
 from mvest.personalisation.estimation import (
     CaseEstimate,
@@ -38,7 +39,8 @@ def personalise(
 ) -> Personalised:
     """Estimate the unknowns of a case.
 
-    A numerical failure is part of the result, with its reason; only inadmissible input raises.
+    A numerical failure is part of the result, with its reason; only inadmissible input raises. The
+    calibration is found and checked first, and applied by `mvest.personalisation.record`.
 
     Parameters
     ----------
@@ -53,6 +55,7 @@ def personalise(
     """
     settings = default_settings(case) if settings is None else settings
     problem = CaseProblem.of(case, settings, store, on_step, on_iterate)
+    calibration = calibration_for(case, problem.settings)
     generic = problem.generic()
     before: dict[str, FloatArray] = {}
     if generic.prediction.converged:
@@ -71,6 +74,7 @@ def personalise(
         error_samples=0 if point.errors.frame_samples is None else len(point.errors.frame_samples),
         unaccounted=estimate.unaccounted,
         moved=estimate.moved,
+        calibration=calibration,
     )
     if before and result.estimate is not None and result.fitted is not None:
         after = predicted_frames(problem, point, result.estimate, result.fitted)

@@ -53,6 +53,8 @@ def diagnostics_of(
         "unlike": texts(unlike),
         "unaccounted": texts(*fit.unaccounted),
     }
+    if fit.calibration.stale or fit.calibration.calibration is not None:
+        seen["calibration"] = texts(fit.calibration.why)
     if filtered is None or not estimated:
         return seen
     if (check := filtered.check) is not None:

@@ -25,23 +25,36 @@ measurements   frame, shape (observed, generic or personalised), and one column 
 physiology     columns of `mvest.closure.physiology.Row`: the closed valve at the estimate
 resistance     part, of, and one column (%) for each of `mvest.mechanics.resistance.WAYS`: by which
                tissue it resists, and where the information on the moduli comes from
+calibration    (one row) measured_for, patients (0: not calibrated), why not; parameters,
+               log_estimate and log_covariance before: `FoundCalibration.row`
 image_step     with image_frames and pictures: `DetectedValve.details`
 ============== ==================================================================================
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from mvest.cases.case import Role
 from mvest.cases.plausibility import implausible_values
+from mvest.estimation.transform import to_filter
 from mvest.personalisation.diagnostics import diagnostics_of
+from mvest.personalisation.known import data_alone, derived_quantities
 from mvest.personalisation.result import Personalised
 from mvest.problem.estimate import StudyResult
 from mvest.problem.fields import as_stored, chord_fields
-from mvest.problem.record import EstimateRecord, FrameFit, Numbers, Row, Spread, finite, record_of
+from mvest.problem.record import (
+    UNCALIBRATED,
+    EstimateRecord,
+    FrameFit,
+    Numbers,
+    Row,
+    Spread,
+    finite,
+    record_of,
+)
 from mvest.problem.verdict import judge
 from mvest.valve.measure.clinical import clinical_measurements
 
@@ -61,11 +74,16 @@ def record_of_case(
     images : mapping, optional
         `DetectedValve.details` of the volume that the case comes from.
     """
-    images = images or {}
+    images, plain, fit = images or {}, fit, calibrated(fit)
     unlike = images["image_step"][0]["unlike"] if "image_step" in images else ""
-    details = {**_details(fit), **fit.details, **images}
+    details = {**_details(fit), "calibration": _calibration(plain), **fit.details, **images}
+    others, before = dict(fit.alternatives), _record(plain, plain.result)
+    if fit is not plain:
+        others[UNCALIBRATED] = plain.result
     return _record(fit, fit.result).model_copy(
         update={
+            "iterates": before.iterates,
+            "iterate_std": before.iterate_std,
             "verdict": judge(diagnostics_of(fit, gate, unlike)),
             "correlation": _correlation(fit.result),
             "frames": tuple(
@@ -76,10 +94,41 @@ def record_of_case(
                 )
                 for one in fit.frames
             ),
-            "alternatives": {name: _record(fit, other) for name, other in fit.alternatives.items()},
+            "alternatives": {name: _record(fit, other) for name, other in others.items()},
             "details": {name: rows for name, rows in details.items() if rows},
         }
     )
+
+
+def calibrated(fit: Personalised) -> Personalised:
+    """The same with calibrated moduli, and what follows from them; itself without a calibration."""
+    filtered, used = fit.result.filtered, fit.calibration.calibration
+    if used is None or filtered is None or fit.result.estimate is None:
+        return fit
+    prior = to_filter(filtered.transform, filtered.prior)
+    found = used.applied(filtered.names, filtered.transformed, prior)
+    means = np.array(filtered.transformed_iterates)
+    covariances = np.array(filtered.transformed_iterate_covariances)
+    means[-1], covariances[-1] = found.mean, found.covariance
+    filtered = replace(
+        filtered, transformed_iterates=means, transformed_iterate_covariances=covariances
+    )
+    details = dict(fit.details)
+    if "known" in details:
+        moduli = tuple(derived_quantities(filtered))
+        names = {row["name"] for row in moduli}
+        others = (row for row in details["known"] if row["name"] not in names)
+        details |= {"known": (*moduli, *others), "data_alone": tuple(data_alone(filtered))}
+    return replace(fit, result=replace(fit.result, filtered=filtered), details=details)
+
+
+def _calibration(fit: Personalised) -> tuple[Row, ...]:
+    filtered = fit.result.filtered
+    if filtered is None or fit.result.estimate is None:
+        return ()
+    prior = to_filter(filtered.transform, filtered.prior)
+    row = fit.calibration.row(filtered.names, filtered.transformed, prior)
+    return () if row is None else (row,)
 
 
 def _record(fit: Personalised, result: StudyResult) -> EstimateRecord:
@@ -123,10 +172,10 @@ def _details(fit: Personalised) -> dict[str, tuple[Row, ...]]:
 
 
 def _settings(name: str, value: Any) -> Iterator[Row]:
-    """The settings below ``name``, one row each; the record itself has the unknowns."""
+    """The settings below ``name``, one row each; the record has the unknowns, a detail the rest."""
     if isinstance(value, Mapping):
         for key, item in value.items():
-            if key != "unknowns":
+            if key not in ("unknowns", "calibration"):
                 yield from _settings(f"{name}.{key}" if name else key, item)
     else:
         plain = value if isinstance(value, str | int | float | None) else str(value)

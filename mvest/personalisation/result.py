@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from mvest.cases.case import Frame, ValveCase
+from mvest.personalisation.calibration import FoundCalibration
 from mvest.personalisation.settings import PersonaliseSettings
 from mvest.problem.estimate import StudyResult
 from mvest.problem.record import Row
@@ -67,6 +68,8 @@ class Personalised:
     #: Largest distance of a modulus from the last linearisation point of the geometry, in standard
     #: deviations; None if that is the measured geometry.
     moved: float | None = None
+    #: Applied by `mvest.personalisation.record`; ``result`` is uncalibrated.
+    calibration: FoundCalibration = field(default_factory=FoundCalibration)
 
     def __str__(self) -> str:
         frames = [

@@ -32,6 +32,10 @@ STIFFENS = "stiffening."
 """Prefix of unknowns that say how much the tissue of a leaflet stiffens."""
 
 
+PACKAGE = "package"
+"""Setting that stands for the calibrations of the package."""
+
+
 @dataclass(frozen=True, slots=True)
 class Prior:
     """The prior of one unknown of a case."""
@@ -150,6 +154,9 @@ class CaseChoices:
     #: Leaflet -> another law that its tissue may follow, which widens the intervals. Empty: the
     #: linear law is right.
     nuisance_law: dict[str, ExponentialTissue] = field(default_factory=dict)
+    #: The calibration of the moduli (`mvest.personalisation.calibration`): ``package``, a file, or
+    #: None for none.
+    calibration: str | None = None
     #: Errors of the pressures of several fitted closed frames. None: only the common factor, if
     #: that is an unknown.
     pressures: PressureErrors | None = None
@@ -258,6 +265,7 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
         ),
         nuisance_law=CURVES,
         pressures=PressureErrors(),
+        calibration=PACKAGE,
     )
     if not from_volume:
         return surfaces

@@ -29,6 +29,9 @@ Row = Mapping[str, Any]
 LEVEL = 0.95
 """Probability of the intervals."""
 
+UNCALIBRATED = "uncalibrated"
+"""Name of the alternative with the moduli before their calibration."""
+
 
 class Frozen(BaseModel):
     """Part of a record: immutable, with no extra fields."""
@@ -148,7 +151,7 @@ class EstimateRecord(Frozen):
     objective: Numbers = ()  #: (i,)
     seconds: float | None = None  #: wall-clock time of the estimation
     #: Name -> another estimate from the same data: ``moduli_only`` with all nuisances fixed,
-    #: ``paper`` by the paper's method.
+    #: ``paper`` by the paper's method, `UNCALIBRATED`.
     alternatives: Mapping[str, EstimateRecord] = {}
     #: Name -> rows of plain data for reports (see `mvest.personalisation.record`).
     details: Mapping[str, tuple[Row, ...]] = {}

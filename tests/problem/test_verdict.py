@@ -58,6 +58,7 @@ GOOD = ALWAYS | {
     "held_out": held(-0.3),
     "closure": leak(3.0),
     "again": one(0.0),
+    "calibration": (),
     "gate": one(0.0),
 }
 
@@ -66,9 +67,9 @@ def test_an_estimate_that_passes_all_checks_is_trustworthy():
     verdict = judge(GOOD)
     assert verdict.trust == TRUSTWORTHY
     assert verdict.failed_checks == ()
-    assert len(verdict.passed) == 14
+    assert len(verdict.passed) == 15
     assert verdict.missing == ()
-    assert str(verdict) == "trustworthy: 14 checks passed"
+    assert str(verdict) == "trustworthy: 15 checks passed"
 
 
 CASES = [
@@ -87,6 +88,7 @@ CASES = [
     ("held_out", held(0.01), DOUBTFUL, "frame late"),
     ("closure", leak(121.0), NONE, "leaves 121 mm² free, the observed one 2 mm²"),
     ("again", one(1.0), DOUBTFUL, "reaches another closed state"),
+    ("calibration", texts("measured for other detectors"), DOUBTFUL, "was measured for other det"),
     ("gate", one(1.0), DOUBTFUL, "did not pass the gate"),
 ]
 
@@ -120,7 +122,7 @@ def test_the_gravest_check_decides_and_comes_first():
 
 def test_checks_without_data_are_missing_and_do_not_count_as_passed():
     verdict = judge(ALWAYS)
-    assert len(verdict.missing) == 11
+    assert len(verdict.missing) == 12
     # Two of these are needed, and two failed_checks are one too many.
     assert verdict.trust == NONE
     assert [failed.check for failed in verdict.failed_checks] == [

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from experiments.common.building.closure import mechanics_of, mesh_store
 from experiments.common.progress import PartBar, SolveBar, say
@@ -26,12 +26,19 @@ from mvest.errors import ConfigurationError
 from mvest.exchange.volumes import files_of_volume
 from mvest.imaging.detection.detect import NoValveError
 from mvest.observation.learned import ErrorBeliefs
+from mvest.personalisation.calibration import CALIBRATIONS
 from mvest.personalisation.chain import personalise
 from mvest.personalisation.design import expect_case
 from mvest.personalisation.model import build_coarse, gate_case, gate_lines, with_pressures
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Expected
-from mvest.personalisation.settings import CaseChoices, PersonaliseSettings, Prior, with_stiffening
+from mvest.personalisation.settings import (
+    PACKAGE,
+    CaseChoices,
+    PersonaliseSettings,
+    Prior,
+    with_stiffening,
+)
 from mvest.problem.record import Row
 from mvest.problem.registration import REGISTRATION
 from mvest.quantities import Value
@@ -60,12 +67,19 @@ class UnknownSettings:
     treatment: Literal["estimated", "fixed"] = "estimated"
 
 
+def _calibration_read(value: str, _: Values) -> Any:
+    """The content of a calibration, or of all those of the package."""
+    place = CALIBRATIONS if value == PACKAGE else Path(value)
+    return contents(place) if place.exists() else value
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PersonalSettings(CaseChoices):
     """How a case is personalised; with ``errors`` the noise is learned from these beliefs."""
 
     unknowns: dict[str, UnknownSettings] = field(default_factory=dict)
     errors: ErrorBeliefs | None = None
+    calibration: Annotated[str | None, Reads(_calibration_read)] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

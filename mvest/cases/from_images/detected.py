@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from mvest.cases.case import ValveCase
+from mvest.cases.case import Arrival, ValveCase
 from mvest.cases.folder import write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
@@ -283,7 +283,11 @@ def detect_in_volume(
         valve=valve,
         rows=with_bands(valve, rows, accuracy),
         frames=frames,
-        case=replace(case, derived=(*case.derived, correction)),
+        case=replace(
+            case,
+            derived=(*case.derived, correction),
+            arrival=Arrival("volume", model.digest),
+        ),
         settings=settings,
         model=model,
         unlike=unlike,

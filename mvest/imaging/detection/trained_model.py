@@ -119,18 +119,35 @@ class DetectionModel:
     accuracy: DetectionAccuracy | None = None  #: None if it was never measured
     sha256: str = ""  #: of the file it was read from
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that affects a detection or its errors, so not of its provenance."""
+        digest = hashlib.sha256()
+        for name, array in sorted(_arrays(self).items()):
+            digest.update(f"{name} {array.shape} ".encode())
+            digest.update(array.tobytes())
+        return digest.hexdigest()
+
 
 def save_model(path: Path | str, model: DetectionModel) -> None:
     """Write a model as one ``.npz``: arrays, trees as LightGBM's text, provenance as JSON."""
-    shape = model.shape
+    layout = model.shape.layout
     about = {
         "format": FORMAT,
         "version": VERSION,
-        "columns": shape.layout.columns,
-        "rows": shape.layout.rows,
+        "columns": layout.columns,
+        "rows": layout.rows,
         "trained_on": model.trained_on,
     }
-    arrays: dict[str, Any] = {"about": _bytes(json.dumps(about, sort_keys=True))}
+    arrays: dict[str, Any] = {"about": _bytes(json.dumps(about, sort_keys=True)), **_arrays(model)}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_atomically(path, buffer.getvalue())
+
+
+def _arrays(model: DetectionModel) -> dict[str, NDArray[Any]]:
+    """Trees, shape model and accuracy as they are stored."""
+    arrays: dict[str, Any] = {}
     for name in STAGES:
         for k, text in enumerate(model.boosters[name].texts):
             arrays[f"trees.{name}.{k}"] = _bytes(text)
@@ -140,9 +157,7 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
         if value is not None:
             single = len(lengths) > 1 and set(lengths) & set(HALVED)
             arrays[name] = np.asarray(value, dtype=np.float32 if single else np.float64)
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    write_atomically(path, buffer.getvalue())
+    return arrays
 
 
 def load_model(path: Path | str) -> DetectionModel:

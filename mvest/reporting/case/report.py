@@ -26,7 +26,12 @@ from mvest.personalisation.result import Expected, Personalised
 from mvest.problem.fields import CaseFields, case_fields
 from mvest.problem.record import EstimateRecord, Spread
 from mvest.reporting.case.figures import case_figure, estimates_figure, shapes_figure
-from mvest.reporting.case.tables import expected_tables, report_tables, unknown_table
+from mvest.reporting.case.tables import (
+    calibration_text,
+    expected_tables,
+    report_tables,
+    unknown_table,
+)
 from mvest.reporting.case.view import CAMERAS, case_view
 from mvest.reporting.expectation import trade_off_text
 from mvest.reporting.figures import save_figure_with
@@ -179,6 +184,7 @@ def _write_page(
         step=_only_row(record, "image_step"),
         tables=defaultdict(list, {k: one.readable() for k, one in report_tables(record).items()}),
         confounded=[trade_off_text(group, labels) for group in record.confounded],
+        calibration=calibration_text(record),
         number=number,
         ended=ended,
         provenance=[{"": key, "value": str(value)} for key, value in source.items() if value],

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from mvest.personalisation.result import Expected
-from mvest.problem.record import EstimateRecord, FrameFit, Row, Unknown
+from mvest.problem.record import UNCALIBRATED, EstimateRecord, FrameFit, Row, Unknown
 from mvest.problem.registration import label_of
 from mvest.problem.verdict import NONE
 from mvest.reporting.expectation import expected_table
@@ -155,6 +155,21 @@ def expected_tables(expected: Expected) -> dict[str, Table]:
     return {name: one for name, one in tables.items() if len(one)}
 
 
+def calibration_text(record: EstimateRecord) -> str:
+    """A sentence on the calibration of the moduli, and what they are without it; may be empty."""
+    (row,) = record.detail_rows("calibration") or ({"why": "", "patients": 0},)
+    before = record.alternatives.get(UNCALIBRATED)
+    if before is None:
+        why = row["why"]
+        return f"The moduli are not calibrated with simulated patients: {ended(why)}" if why else ""
+    moduli = ", ".join(
+        f"{own.label} {number(own.estimate, 2)} ({number(own.low, 2)} to {number(own.high, 2)}) "
+        f"{own.unit}"
+        for own in before.moduli
+    )
+    return f"Calibrated with {row['patients']} simulated patients; uncalibrated: {moduli}."
+
+
 def estimate_text(record: EstimateRecord) -> str:
     """What a terminal says of an estimate: verdict, unknowns, frames."""
     name, verdict = record.case or "estimate", record.verdict
@@ -166,6 +181,7 @@ def estimate_text(record: EstimateRecord) -> str:
         lines.append(f"{no_number}: {record.reason}")
     if record.is_stated:
         lines.append(unknown_table(record.unknowns).text())
+        lines += filter(None, [calibration_text(record)])
     if record.frames:
         lines.append(frame_table(record.frames).text())
     return "\n".join(lines)

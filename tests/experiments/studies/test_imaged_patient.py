@@ -4,17 +4,24 @@ import json
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
 
+from experiments.cli import main
 from experiments.common.cases import blind
 from experiments.common.cases.own_case import PersonalSettings
 from experiments.common.schema import build
 from experiments.common.study import Job
+from experiments.results.published import publish
 from experiments.studies import imaged_patient
 from experiments.studies.imaged_patient import HIDDEN, KNOWN, SEGMENTED, VOLUME
 from experiments.studies.imaged_patient import TRUTH as TRUTH_FOLDER
 from mvest.errors import InputError
+from mvest.personalisation.calibration import MeasuredFor, calibrate, read_calibration
 from mvest.simulation.virtual_patient import PatientSettings
+from tests.calibrated_patients import patients
+from tests.experiments.studies.made_up import made_up
 from tests.experiments.studies.made_up_patients import a_result
 
 TRUTH = {"E_f.posterior": 2.0, "E_f.anterior": 6.0, "pressure_scale": 1.05}
@@ -36,7 +43,7 @@ def estimated(tmp_path, place, monkeypatch):
     """Runs the study with what each estimation leaves: a result, or an error's text."""
     given = []
 
-    def run(volume: Any, known: Any, segmented: Any) -> Any:
+    def run(volume: Any, known: Any, segmented: Any, better: Any = (KNOWN, SEGMENTED)) -> Any:
         left = {
             place / VOLUME: (volume, place / HIDDEN),
             place / HIDDEN / KNOWN: (known, place / TRUTH_FOLDER),
@@ -59,7 +66,7 @@ def estimated(tmp_path, place, monkeypatch):
         one = PatientSettings(name="one", description="")
         priors = {key: {"mean": 1.0, "std": 1.0} for key in ("E_f.anterior", "E_f.posterior")}
         personal = build(PersonalSettings, {"unknowns": priors})
-        settings = SimpleNamespace(patient=one, echo=None, personal=personal)
+        settings = SimpleNamespace(patient=one, personal=personal, better=better)
         job = Job({"imaged": {}, "seed": 7}, settings, tmp_path)
         return imaged_patient.run_imaged_patient(job)
 
@@ -88,3 +95,53 @@ def test_a_failed_volume_keeps_estimates_from_better_geometries(estimated):
     assert [own.estimate for own in estimate.alternatives[KNOWN].moduli] == [5.8, 2.1]
     # An estimate that did not converge has no numbers.
     assert [own.estimate for own in estimate.alternatives[SEGMENTED].moduli] == [None] * 2
+
+
+def test_a_calibration_needs_the_volume_alone(estimated):
+    (estimate,) = estimated(a_result(5.0, 2.5), "not asked", "not asked", ()).estimates
+    assert [(own.truth, own.estimate) for own in estimate.moduli] == [(6.0, 5.0), (2.0, 2.5)]
+    assert estimate.alternatives == {}
+
+
+MEASURED_FOR = MeasuredFor(way="volume", made_by="ab" * 32, settings="cd" * 32)
+
+
+def published(folder, estimates):
+    """Publishes records of a calibration."""
+    about = {"study": "imaged_patient", "experiment": "volumes_calibration"}
+    records = {
+        f"one-{k:02d}": made_up(table="volume_calibration", row=f"{k}", estimates=(one,), **about)
+        for k, one in enumerate(estimates)
+    }
+    runs = {name: (record, folder / "none") for name, record in records.items()}
+    return publish(imaged_patient.STUDY, folder, runs)
+
+
+def test_a_calibration_is_published_with_each_patient_left_out(tmp_path):
+    estimates = list(patients(np.random.default_rng(1), 40, MEASURED_FOR))
+    written = {path.name for path in published(tmp_path, estimates)}
+    assert {"volume_calibration.md", "volume_calibration.png"} <= written
+    whole, skill, bias = (
+        pd.read_csv(tmp_path / f"volume_calibration{part}.csv", comment="#", index_col=0)
+        for part in ("", "_skill", "_bias")
+    )
+    expected = calibrate(estimates)
+    np.testing.assert_allclose(whole["offset"], expected.offset)
+    np.testing.assert_allclose(whole["spread"], np.exp(expected.log_spread))
+    # The posterior modulus is put in 0.25 too low, and the ratio as much too high.
+    for name, put_in in (("anterior", 0.0), ("posterior", -0.25), ("anterior / posterior", 0.25)):
+        before, after = bias.loc[f"uncalibrated, {name}"], bias.loc[f"calibrated, {name}"]
+        assert abs(before["bias"] - put_in) < 3 * before["bias SE"]
+        assert abs(after["bias"]) < min(0.02, before["bias SE"])
+        assert skill.loc[f"calibrated, {name}", "estimated"] == 40
+    errors = skill["median error"]
+    assert errors["calibrated, posterior"] < 0.8 * errors["uncalibrated, posterior"]
+    path = tmp_path / "mine.json"
+    assert main(["calibrate", str(tmp_path), "volume_calibration", str(path)]) == 0
+    assert read_calibration(path) == expected
+
+
+def test_a_page_says_why_there_is_no_calibration_yet(tmp_path):
+    published(tmp_path, list(patients(np.random.default_rng(1), 3, MEASURED_FOR)))
+    assert "3 estimates that may be stated" in (tmp_path / "volume_calibration.md").read_text()
+    assert not (tmp_path / "volume_calibration.png").exists()

@@ -45,7 +45,8 @@ def run(run, monkeypatch, volume):
         0.5 * rng.standard_normal((20, 2, 2, 3)),
     )
     shape = SimpleNamespace(layout=LAYOUT)
-    model = SimpleNamespace(accuracy=accuracy, sha256="0" * 64, trained_on={"seed": 1}, shape=shape)
+    hashes = {"sha256": "0" * 64, "digest": "1" * 64}
+    model = SimpleNamespace(accuracy=accuracy, trained_on={"seed": 1}, shape=shape, **hashes)
 
     def detect(volume, given, *, min_confidence, progress=None):
         call.told.append(min_confidence)

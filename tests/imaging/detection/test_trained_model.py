@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -38,6 +39,14 @@ def test_a_model_comes_back_as_it_was_saved(trained, loaded, path, tmp_path):
         before, after = getattr(trained.accuracy, name), getattr(loaded.accuracy, name)
         np.testing.assert_allclose(after, before, atol=1e-6)
     assert loaded.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_the_digest_is_of_what_affects_a_detection_and_its_errors(loaded):
+    assert replace(loaded, trained_on={"seed": 99}, sha256="").digest == loaded.digest
+    accuracy = replace(loaded.accuracy, like_from=0.123)
+    trees = {**loaded.boosters, "annulus": loaded.boosters["free_edge"]}
+    others = [replace(loaded, accuracy=accuracy), replace(loaded, boosters=trees)]
+    assert len({loaded.digest, *(other.digest for other in others)}) == 3
 
 
 # --- refused ------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.problem.record import EstimateRecord
+from mvest.problem.record import UNCALIBRATED, EstimateRecord
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, FailedCheck, Verdict
 from mvest.reporting.case.report import report
 from mvest.reporting.case.tables import estimate_text, report_tables
@@ -156,6 +156,24 @@ def test_a_verdict_decides_what_is_stated(case, tmp_path, verdict, begins, says)
     for one in verdict.failed_checks:
         assert one.text in terminal.partition("E_f anterior")[0]
         assert page.index(one.text[1:]) < page.index("Contents")
+
+
+def test_moduli_before_their_calibration_stand_beside_them(case, tmp_path) -> None:
+    row = {"patients": 57, "why": ""}
+    plain = case[0].alternatives["moduli_only"]
+    details = {**case[0].details, "calibration": (row,)}
+    others = {**case[0].alternatives, UNCALIBRATED: plain}
+    known = case[0].model_copy(update={"alternatives": others, "details": details})
+    missing = {**details, "calibration": ({"patients": 0, "why": "the package has none"},)}
+    none = case[0].model_copy(update={"details": missing})
+    line = "Calibrated with 57 simulated patients; uncalibrated: E_f anterior 5.5 (4.9 to 6.1) MPa"
+    absent = "The moduli are not calibrated with simulated patients: the package has none."
+    for record, says in ((known, line), (none, absent)):
+        written = report(record, tmp_path, arrays=case[1])
+        page = Page(written[1].read_text(encoding="utf-8")).text
+        assert page.count(says) == estimate_text(record).count(says) == 1
+        assert page.index(says) < page.index("Verdict")
+    assert "alibrated" not in estimate_text(case[0])
 
 
 def test_tables_of_a_record(case) -> None:
