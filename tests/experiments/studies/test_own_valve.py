@@ -25,12 +25,12 @@ PRESSURE = 100.0
 COLUMNS, ROWS = 48, 13
 COARSE = (
     "personal.mesh.source=structured",
-    "personal.mesh.columns=16",
-    "personal.mesh.rows=2",
-    "personal.mesh.guide_columns=12",
-    "personal.mesh.guide_rows=2",
-    "personal.mesh.contact_columns=60",
-    "personal.mesh.contact_rows=16",
+    "personal.mesh.columns=36",
+    "personal.mesh.rows=4",
+    "personal.mesh.guide_columns=24",
+    "personal.mesh.guide_rows=3",
+    "personal.mesh.contact_columns=108",
+    "personal.mesh.contact_rows=24",
 )
 
 
@@ -43,8 +43,8 @@ def seen():
     tissue = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
     model = ClosureModel(
         valve,
-        template.valve(60, 16),
-        structured_mesh(template, "hex18", 16, 2),
+        template.valve(108, 24),
+        structured_mesh(template, "hex18", 36, 4),
         MechanicsSettings(tissue, ClosureProtocol(pressure_mmHg=PRESSURE)),
         ("E_f.anterior", "E_f.posterior"),
     )
