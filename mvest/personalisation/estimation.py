@@ -28,7 +28,7 @@ from mvest.estimation.transform import Log, to_filter
 from mvest.personalisation.errors import FrameErrors, WeighedObservation, linearise, with_samples
 from mvest.personalisation.fitted_frames import FittedFrames
 from mvest.personalisation.geometry import displacement
-from mvest.personalisation.joint import JointPosterior, LinearFrames, damped_step
+from mvest.personalisation.joint import JointPosterior, damped_step
 from mvest.personalisation.model import CaseClosure, build_model, held_state, with_pressures
 from mvest.personalisation.settings import STIFFENS, PersonaliseSettings, Prior
 from mvest.personalisation.sources import ClosedValve
@@ -343,14 +343,8 @@ def _nearer(
     begin = problem.transform.forward(point.m)
     was = point.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
     here = posterior.misfit_at(point.m, point.prediction, point.errors.displaced_by)
-    left = residual - point.errors.offset(modes)
-    if not problem.fitted.corresponding:
-        y, slope = point.prediction.y, problem.transform.derivative(begin)
-        moves = [own.moves.reshape(len(y), -1) for own in point.errors.geometry]
-        all_slopes = np.concatenate([point.prediction.jacobian * slope, *moves], axis=1)
-        frames = LinearFrames(begin, was, y, all_slopes)
-        end, modes, left = posterior.compared(frames, end, modes)
-    predicted = here - posterior.misfit(end, left, modes)
+    offset = point.errors.offset(modes)
+    predicted = here - posterior.misfit(end, residual - offset, modes)
 
     def trial(share: float) -> tuple[float, LinearisationPoint] | str:
         return _displaced(

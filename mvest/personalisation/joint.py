@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-import scipy
 
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
@@ -20,28 +19,11 @@ from mvest.typing import FloatArray
 
 T = TypeVar("T")
 
-COMPARISONS = 10
-"""Most Gauss-Newton steps of a comparison with linearly predicted frames. In three draws from the
-prior of a simulated valve, distances to a surface took 7 to 9 steps, corresponding vertices 1."""
-
-NEAR = 0.25
-"""Standard deviations; a smaller step is the last one."""
-
 TRIALS = 4
 """Lengths of one damped step that are tried."""
 
 AS_PREDICTED = 0.75
 """Share of the gain predicted to first order that ends the damping of a step."""
-
-
-@dataclass(frozen=True, eq=False)
-class LinearFrames:
-    """All frames of a model, linear in filter coordinates and geometry modes about one point."""
-
-    z: FloatArray  #: (p,), of the point
-    modes: tuple[FloatArray, ...]  #: of the point, (q,) by kind
-    y: FloatArray  #: stacked coordinates in mm at the point
-    slopes: FloatArray  #: their derivatives by z and the modes
 
 
 @dataclass(frozen=True)
@@ -100,36 +82,6 @@ class JointPosterior:
         """The misfit of a valve closed with parameters ``m (p,)`` and this geometry."""
         seen = predict(self.observation.of(lambda _: prediction), m)
         return self.misfit(self.transform.forward(m), self.observation.y - seen.y, modes)
-
-    def compared(
-        self, at: LinearFrames, z: FloatArray, modes: tuple[FloatArray, ...]
-    ) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray]:
-        """Joint mode for linearly predicted frames, whose comparison need not be linear.
-
-        The distance of a point to a surface changes with the surface's direction, but costs little
-        beside a closure. Gauss-Newton steps from parameters ``z (p,)`` and amplitudes ``modes
-        (q,)`` by kind; returned are those of the mode, and the residual ``(k,)`` there.
-        """
-        sizes = self.errors.geometry_sizes(self.learned)
-        spread = np.concatenate([np.full(len(q), s) for s, q in zip(sizes, modes, strict=True)])
-        F = scipy.linalg.block_diag(self.prior.factor, np.diag(spread))
-        ends = np.cumsum([len(z), *(len(q) for q in modes)])[:-1]
-        centre = np.concatenate([self.prior.mean, np.zeros(len(spread))])
-        start = np.concatenate([at.z, *at.modes])
-        u = np.concatenate([z, *modes])
-        for _ in range(COMPARISONS):
-            frames = Prediction(at.y + at.slopes @ (u - start), at.slopes)
-            seen = predict(self.observation.of(lambda _, y=frames: y), u, derivatives=True)
-            residual = self.observation.y - seen.y
-            W = self.noise.whiten(seen.jacobian @ F)
-            hessian = W.T @ W + np.eye(len(u))
-            v = scipy.linalg.solve_triangular(F, u - centre, lower=True)
-            step = np.linalg.solve(hessian, W.T @ self.noise.whiten(residual) - v)
-            u, residual = u + F @ step, residual - seen.jacobian @ (F @ step)
-            if step @ hessian @ step < NEAR**2:
-                break
-        z, *found = np.split(u, ends)
-        return z, tuple(found), residual
 
     def step(self, z: FloatArray, residual: FloatArray, H: FloatArray) -> FloatArray:
         """Parameters ``(p,)`` after a Gauss-Newton step with the geometry marginalised.

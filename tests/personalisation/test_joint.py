@@ -19,7 +19,7 @@ from mvest.personalisation import estimation, personalise
 from mvest.personalisation.chain import predicted_frames
 from mvest.personalisation.estimation import SETTLED, CaseProblem
 from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
-from mvest.personalisation.joint import JointPosterior, LinearFrames, damped_step
+from mvest.personalisation.joint import JointPosterior, damped_step
 from mvest.problem.registration import REGISTRATION
 from mvest.problem.verdict import CHECKS
 from tests.made_up_closure import (
@@ -84,40 +84,6 @@ def test_a_step_of_parameters_and_modes_is_that_of_least_squares(problem):
     # With a known geometry only parameters and the other column are left.
     fitted = posterior.refitted(z, Prediction(np.zeros(K), H))
     np.testing.assert_allclose(fitted, z + best(beside, sizes=np.ones(1))[:3], atol=1e-9)
-
-
-@pytest.mark.parametrize("bend", [0.0, 0.2])
-def test_a_comparison_that_is_not_linear_is_compared_to_its_end(problem, bend):
-    posterior, rows, H, beside = problem
-    prior, y = posterior.prior, posterior.observation.y
-
-    def compared(model):
-        def predicted(u):
-            plain = model(u)
-            slope = (1.0 + 2.0 * bend * plain.y)[:, None]
-            return Prediction(plain.y + bend * plain.y**2, slope * plain.jacobian)
-
-        return predicted
-
-    observation = SimpleNamespace(y=y, of=compared)
-    posterior = replace(posterior, observation=observation)
-    start, was = prior.mean + np.array([0.3, -0.1, 0.2]), np.full(Q, 0.4)
-    frames = LinearFrames(start, (was,), H @ start + rows @ was, np.hstack([H, rows]))
-    z, (modes,), left = posterior.compared(frames, prior.mean, (np.zeros(Q),))
-
-    def residuals(u):
-        """Those of the joint mode, with the other column as one more unknown."""
-        flat = H @ u[:3] + rows @ u[3 : 3 + Q]
-        seen = y - flat - bend * flat**2 - beside[:, 0] * u[-1]
-        own = (u[:3] - prior.mean) / prior.std, u[3 : 3 + Q] / SIZE, u[-1:]
-        return np.concatenate([seen / STD, *own])
-
-    best = least_squares(residuals, np.zeros(3 + Q + 1), xtol=1e-12, ftol=1e-12).x
-    # The last step is below a quarter of a standard deviation; one is enough if all is linear.
-    tolerance = 1e-7 if bend == 0.0 else 0.02
-    np.testing.assert_allclose(np.append(z, modes), best[: 3 + Q], atol=tolerance)
-    flat = H @ z + rows @ modes
-    np.testing.assert_allclose(left, y - flat - bend * flat**2, atol=tolerance)
 
 
 def test_a_step_is_damped_by_a_parabola_through_its_trials():
