@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from mvest.closure.model import ClosureModel
 from mvest.exchange.surfaces import write_surface
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
-from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
 
@@ -22,7 +21,7 @@ REGIONS = ("anterior", "posterior")
 TRUE = (8.5, 2.6)
 """MPa, of the closure that is seen; the priors' means are 6.23 and 2.09."""
 PRESSURE = 100.0
-COLUMNS, ROWS = 48, 13
+COLUMNS, ROWS = 80, 21
 COARSE = (
     "personal.mesh.source=structured",
     "personal.mesh.columns=36",
@@ -37,8 +36,8 @@ COARSE = (
 @pytest.fixture(scope="module")
 def seen():
     """The open valve, and the vertices of it as it closes."""
-    # The same thickness everywhere, as where a user gives none.
-    template = Template(TemplateParameters().changed({"leaflets.edge_thinning": 1.0}))
+    # Its thickness falls towards the free edge, as is assumed where a user gives none.
+    template = Template()
     valve = template.valve(COLUMNS, ROWS)
     tissue = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
     model = ClosureModel(
@@ -108,8 +107,8 @@ def test_the_moduli_are_found_wherever_the_valve_lies(run, tmp_path, seen):
             assert row["low"] < true < row["high"]
     # Axes of shift and turn are the scanner's; nothing else may depend on them, but for where the
     # estimation stops: it is linearised anew until it moves by less than a quarter of a standard
-    # deviation (conf/personal/renewed.yaml).
+    # deviation (conf/personal/renewed.yaml), so two of them differ by half of it at most.
     for name in ("E_f.anterior", "E_f.posterior", "pressure_scale", "chord_rest_length"):
         one, other = (unknowns[name] for unknowns in found)
         std = np.log(one["high"] / one["low"]) / (2 * 1.96)
-        assert abs(np.log(one["estimate"] / other["estimate"])) < 0.25 * std
+        assert abs(np.log(one["estimate"] / other["estimate"])) < 0.5 * std
