@@ -85,7 +85,7 @@ class ClosureModel:
     reach: float = np.inf
     #: the same valve and parameters on a coarser mesh. A closure that would start from the open
     #: valve is computed there first; its closed state is the starting point for the equilibrium on
-    #: this mesh. A guide may have a guide.
+    #: this mesh. A guide may have a guide. Without `repeat` it does not lead.
     guide: ClosureModel | None = None
     #: whether a failed continued closure is repeated with the guide, and then from the open valve,
     #: which takes long and seldom succeeds
@@ -341,7 +341,7 @@ class ClosureModel:
                 )
                 if simulation.converged:
                     break
-        guide = self.guide if straight and unsettled(simulation) else None
+        guide = self.guide if straight and self.repeat and unsettled(simulation) else None
         if guide is not None and self._in_guide is not None:
             coarse = guide.close(m, sensitivities=False).simulation
             if coarse.converged:

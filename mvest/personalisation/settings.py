@@ -99,7 +99,7 @@ class CaseMesh:
     source: str = "automatic"
     columns: CellsAround = 40  #: cells of a structured mesh
     rows: CellsAlong = 5  #: cells of a structured mesh
-    #: Cells of the coarser guide mesh, which leads the first closure.
+    #: Cells of the coarser mesh on which errors of law and mesh are computed.
     guide_columns: CellsAround = 24
     guide_rows: CellsAlong = 3
     edge_length: EdgeLength = 2.5  #: mm, of an unstructured mesh
