@@ -38,7 +38,7 @@ close without coarser meshes, and the pressure of a volume has a prior of 15 %.
 GOLDEN = {
     "twin": "5f237e0fb427",
     "case": "e3c60afb707d",
-    "patient": "305da4b6d2c8",
+    "patient": "9bec934fa90e",
     "volume": "3b48dada6fc6",
 }
 """Kind of golden run -> digest of its golden numbers at the present generation."""
