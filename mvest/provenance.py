@@ -31,8 +31,8 @@ NUMBERS = {"twin": 1, "case": 2, "patient": 2, "volume": 2}
 
 Raise a kind whenever the golden numbers of its runs change (``tests/test_golden.py``): *twin* for
 the default valve, *case* for a case folder, *patient* for virtual patients, *volume* for an image.
-Generation 1 is the default valve of three scallops with branching chordae; in generation 2 cases and
-patients close without coarser meshes, and the pressure of a volume has a prior of 15 %.
+Generation 1 is the default valve of three scallops with branching chordae; in generation 2 cases
+and patients close without coarser meshes, and the pressure of a volume has a prior of 15 %.
 """
 
 GOLDEN = {
