@@ -79,11 +79,11 @@ class Configured:
     @cached_property
     def jobs(self) -> int:
         """The number of its jobs."""
-        keys = {key: self.values.get(key) or {} for key in ("hydra", "sweep")}
-        config = OmegaConf.merge({"hydra": {"sweeper": {}}, "sweep": {}}, keys)
+        hydra, sweep = (self.values.get(key) or {} for key in ("hydra", "sweep"))
+        config = OmegaConf.create({"hydra": {"sweeper": {}, **hydra}, "sweep": sweep})
         if config.sweep:
             config.sweep.size = FULL
-        return len(expand(config, [], None)) if self.has_many else 1  # type: ignore[arg-type]
+        return len(expand(config, [], None)) if self.has_many else 1
 
     def records(self, results: Path) -> dict[str, Record]:
         """Its published records, by name, or of a sweep by the hash of the configuration."""

@@ -26,11 +26,13 @@ from experiments.runner.plan import Plan, earlier
 from mvest.errors import ConfigurationError
 
 
-def expand(config: DictConfig, arguments: Sequence[str], loader: ConfigLoader) -> list[list[str]]:
+def expand(
+    config: DictConfig, arguments: Sequence[str], loader: ConfigLoader | None
+) -> list[list[str]]:
     """The overrides of every job of a sweep, in Hydra's order.
 
     ``config`` is the sweep's own configuration with Hydra's part, ``arguments`` are those of the
-    command line.
+    command line. Without a ``loader``, values cannot be taken from groups of the configuration.
 
     Raises a `ConfigurationError` if the sweep has no such size, no grid, or no job, and a
     `HydraException` if a line is not in Hydra's syntax, or varies a setting continuously.
