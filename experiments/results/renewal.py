@@ -119,7 +119,9 @@ def configured(folder: Path) -> list[Configured]:
 
     def inherited(stem: str) -> dict[str, Any]:
         bases = [one for one in own[stem].get("defaults", ()) if one in list(own)]
-        return (inherited(bases[0]) if bases else {}) | own[stem]
+        of_base = inherited(bases[0]) if bases else {}
+        hydra = {**(of_base.get("hydra") or {}), **(own[stem].get("hydra") or {})}
+        return of_base | own[stem] | ({"hydra": hydra} if hydra else {})
 
     return [Configured(folder.name, one, inherited(one), comment_of(texts[one])) for one in own]
 

@@ -198,6 +198,9 @@ def test_every_page_of_results_is_published_or_known_to_be_without_records():
     # A study that was never run has neither page nor records.
     records = ROOT / "results" / "records"
     assert not [one for one in tables - pages if (records / f"{one}.jsonl").exists()]
+    # The mode is inherited, the seeds are its own.
+    (one,) = chosen(["volumes_calibration"])
+    assert (one.jobs, one.has_many) == (60, True)
     with_names = [one.name for one in published()]
     assert len(set(with_names)) == len(with_names)
     assert {one.name for one in chosen(["table1"])} > {"table1", "table1_tet4"}
