@@ -105,7 +105,8 @@ class IteratedFilter(Filter):
     filter can converge.
 
     The filter stops if the next full step is below the tolerance, without taking it: the reported
-    prediction is that of the estimate.
+    prediction is that of the estimate. After ``max_iterations`` steps it has converged too if the
+    next one would lower J by less than `NEGLIGIBLE_DECREASE`.
     """
 
     #: stop when the next full step changes no parameter by more than this, relative to its size (or
@@ -159,7 +160,8 @@ class IteratedFilter(Filter):
             ):
                 reason = Reason.CONVERGED
             elif iterations == self.max_iterations:
-                reason = Reason.MAX_ITERATIONS
+                near = decrease <= NEGLIGIBLE_DECREASE
+                reason = Reason.CONVERGED if near else Reason.MAX_ITERATIONS
             else:
                 accepted, damping, rejected = _search(run, point, B, step, damping)
                 if accepted is not None:
