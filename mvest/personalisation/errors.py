@@ -54,7 +54,8 @@ class WeighedObservation:
 
     plain: Observed
     R: NoiseCovariance
-    #: ``(k,)``, added to the observation: effect of the displaced geometry on the prediction.
+    #: ``(k,)``, added to the observation: effect of the displaced geometry on the prediction, and
+    #: the prediction's expected error.
     offset: FloatArray | float = 0.0
 
     @property
@@ -161,18 +162,28 @@ class FrameErrors:
 
     def observation(self) -> Observed:
         """The fitted frames with the noise of all errors."""
-        plain, family = self.fitted.observation(), self.family
+        plain, family, offset = self.fitted.observation(), self.family, self.expected
         if self.displaced_by and self.geometry:
             noise = self.noise() if family is None else family
-            return WeighedObservation(plain, noise, self.offset(self.displaced_by))
+            return WeighedObservation(plain, noise, offset + self.offset(self.displaced_by))
         if self.samples is not None:
             if family is None:
-                return WeighedObservation(plain, self.samples.noise)
+                return WeighedObservation(plain, self.samples.noise, offset)
             columns = of_low_rank(self.samples.columns, self.samples.base)
             family = family.plus(ErrorColumns("error samples", columns))
         if family is not None:
-            return WeighedObservation(plain, family)
-        return WeighedObservation(plain, self.noise()) if self.sources else plain
+            return WeighedObservation(plain, family, offset)
+        return WeighedObservation(plain, self.noise(), offset) if self.sources else plain
+
+    @property
+    def expected(self) -> FloatArray | float:
+        """Expected error ``(k,)`` of the prediction by law and mesh."""
+        return sum((source.expected for source in self.sources), start=0.0)
+
+    def measured(self) -> Observed:
+        """The fitted frames with their stated noise, and with the prediction's expected error."""
+        plain = self.fitted.observation()
+        return WeighedObservation(plain, plain.R, self.expected)
 
     def rough_observation(self) -> Observed:
         """The same with blurred surfaces, for a first estimate."""
@@ -239,7 +250,6 @@ def linearise(
     """
     settings, observation = errors.fitted.settings, errors.fitted.observation()
     geometry, laws = settings.nuisance_geometry, settings.nuisance_law
-    mesh = settings.mesh.error_share
     if geometry is None and not laws:
         return errors
     if not settings.mechanics.protocol.equilibrium:
@@ -254,8 +264,8 @@ def linearise(
         found.append(geometry_sources(modes, valve, observation, errors.single_noise(), seen))
     if others:
         found.append(others)
-    elif laws or mesh:
-        found.append(law_and_mesh_sources(laws, mesh, valve, observation))
+    elif laws or settings.mesh.error_std:
+        found.append(law_and_mesh_sources(laws, settings.mesh, valve, observation))
     return replace(
         errors,
         sources=tuple(own for part in found if not isinstance(part, str) for own in part),

@@ -367,8 +367,8 @@ def joint(problem: CaseProblem, result: StudyResult, errors: FrameErrors) -> Joi
     if filtered is None or filtered.prediction is None or not errors.geometry:
         return None
     prior = to_filter(problem.transform, problem.prior)
-    observation = problem.fitted.observation()
-    return JointPosterior(prior, problem.transform, observation, errors, filtered.learned)
+    measured = errors.measured()
+    return JointPosterior(prior, problem.transform, measured, errors, filtered.learned)
 
 
 def _displaced(

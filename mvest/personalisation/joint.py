@@ -32,7 +32,7 @@ class JointPosterior:
 
     prior: Gaussian  #: of the parameters in filter coordinates z
     transform: Transform
-    observation: Observed  #: as measured
+    observation: Observed  #: as measured, and with the expected error of law and mesh
     errors: FrameErrors  #: with linearised effects of the geometry
     learned: LearnedNoise | None  #: None: errors as stated
 

@@ -28,6 +28,7 @@ from mvest.mechanics.steps import Simulation
 from mvest.mechanics.valve_system import HeldState
 from mvest.personalisation.geometry import GeometryModes, rest_lengths_by_ends
 from mvest.personalisation.model import contact_annulus
+from mvest.personalisation.settings import CaseMesh
 from mvest.problem.estimate import Observed
 from mvest.problem.registration import RegisteredModel, registration_of
 from mvest.typing import FloatArray
@@ -53,6 +54,7 @@ class ErrorSource:
     #: (f, n, 3, q) mm, effect of every mode on the observed valve, the open frame first.
     moves: FloatArray
     modes: GeometryModes | None = None  #: of a geometry; None for law and mesh
+    expected: FloatArray | float = 0.0  #: (k,), expected error of the prediction
 
     @property
     def name(self) -> str:
@@ -126,7 +128,7 @@ def geometry_sources(
 
 def law_and_mesh_sources(
     tissue: Mapping[str, ExponentialTissue],
-    mesh_share: float,
+    mesh: CaseMesh,
     valve: ClosedValve,
     observation: Observed,
 ) -> tuple[ErrorSource, ...] | str:
@@ -135,11 +137,10 @@ def law_and_mesh_sources(
     Tissue stiffens, so at the same mean stress its shape differs from that of the linear law. Each
     leaflet in turn gets an exponential tissue that is as stiff as the linear one at the stretch of
     closed leaflets. The change of the equilibrium is one standard deviation of the position of the
-    tissue between both laws. The error of the mesh has a share of its difference from the guide
-    mesh, if there is one, as standard deviation.
+    tissue between both laws. Expected error of the mesh and its standard deviation are shares of
+    its difference from the guide mesh, if there is one.
 
-    ``tissue`` maps regions to exponential tissues, of which only the shape of the curve counts;
-    ``mesh_share`` 0 leaves mesh errors out.
+    ``tissue`` maps regions to exponential tissues, of which only the shape of the curve counts.
     """
     model, at, states = valve.closure()
     coarse = model.guide or model
@@ -152,17 +153,19 @@ def law_and_mesh_sources(
         if isinstance(change, str):
             return change
         changes[LAW] = valve.turned(change)
-    if mesh_share and model.guide is not None:
+    if mesh.error_std and model.guide is not None:
         fine = valve.predicted.reshape(-1, *model.valve.surface.vertices.shape)
         moves = np.zeros((*fine.shape, 1))
         coarser = valve.registered.seen(_observed(coarse, first)[1:], valve.m)
-        moves[1:, ..., 0] = mesh_share * (fine[1:] - coarser)
+        moves[1:, ..., 0] = mesh.error_std * (fine[1:] - coarser)
         changes[MESH] = moves
-    rows = {name: valve.rows(observation, moves) for name, moves in changes.items()}
-    return tuple(
-        ErrorSource(ErrorColumns(name, rows[name]), rows[name], moves)
-        for name, moves in changes.items()
-    )
+    found = []
+    for name, moves in changes.items():
+        rows = valve.rows(observation, moves)
+        times = -mesh.expected_error / mesh.error_std if name == MESH else 0.0
+        expected = times * rows[:, 0] if times else 0.0
+        found.append(ErrorSource(ErrorColumns(name, rows), rows, moves, expected=expected))
+    return tuple(found)
 
 
 def law_change(

@@ -219,6 +219,24 @@ def test_relinearisation_ends_at_the_joint_mode_of_moduli_and_geometry(monkeypat
         assert fit.moved > CHECKS["moved"].limits[0]
 
 
+@pytest.mark.parametrize("renewals", [0, 2])
+def test_an_exact_valve_is_compared_with_a_model_of_known_error(monkeypatch, renewals):
+    case, known = bent_case(monkeypatch, curve=1.0)
+    closed, error = case.frame(Role.CLOSED), 0.4 * FIELDS["E_f.posterior"]
+    exact = replace(closed, vertices=closed.vertices - error)
+    exact = replace(case, frames=tuple(exact if f is closed else f for f in case.frames))
+
+    def estimated(case, expected):
+        source = replace(error_source(1e-6 * BENT[:, None]), expected=expected)
+        name = "mvest.personalisation.errors.law_and_mesh_sources"
+        monkeypatch.setattr(name, lambda *_: (source,))
+        return renewed(case, known, renewals, tolerance=1e-9).result.estimate
+
+    without = estimated(case, 0.0)
+    np.testing.assert_allclose(estimated(exact, error.ravel()), without, rtol=1e-6)
+    assert np.abs(estimated(exact, 0.0) / without - 1.0).max() > 0.05
+
+
 def test_held_out_frames_have_the_displaced_boundary(monkeypatch):
     case, known = bent_case(monkeypatch, curve=1.0)
     closed = case.frame(Role.CLOSED)

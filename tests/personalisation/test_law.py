@@ -12,6 +12,8 @@ from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
+from mvest.personalisation.errors import FrameErrors
+from mvest.personalisation.settings import CaseMesh
 from mvest.personalisation.sources import ClosedValve, law_and_mesh_sources, law_change
 from mvest.problem.registration import RegisteredModel
 from tests.closure.test_model import AT, GENTLE, SMALL, TISSUE, model_of
@@ -53,7 +55,7 @@ def test_the_change_is_that_to_the_equilibrium_of_the_other_law(gentle):
 
 def test_columns_are_turned_as_the_valve_is_seen(gentle):
     valve, seen = turned(gentle)
-    (law,) = law_and_mesh_sources(STIFFENING, 0.5, valve, seen)  # no guide, no mesh error
+    (law,) = law_and_mesh_sources(STIFFENING, CaseMesh(), valve, seen)  # no guide, no mesh error
     assert (law.name, law.columns.factor) == ("law", 1.0)
     first = gentle.rests(AT, [])
     change = law_change(gentle, AT, [], STIFFENING, first)[1, ..., 0]
@@ -62,14 +64,24 @@ def test_columns_are_turned_as_the_valve_is_seen(gentle):
     assert law_change(gentle, AT, [], {"septal": STIFFENING["anterior"]}, first).shape[-1] == 0
 
 
-def test_the_mesh_error_is_a_share_of_the_difference_from_the_guide(gentle):
+@pytest.mark.parametrize("source", ["structured", "tetwild"])
+def test_the_mesh_error_is_extrapolated_from_the_guide(gentle, source):
     valve, seen = turned(replace(model_of(GENTLE), guide=gentle))
-    (mesh,) = law_and_mesh_sources({}, 0.4, valve, seen)
+    # With an error e h², 48 and 24 cells around differ by three times the error of the finer ones.
+    mesh = CaseMesh(source, columns=48, guide_columns=24)
+    (found,) = law_and_mesh_sources({}, mesh, valve, seen)
     other = RegisteredModel(gentle, valve.registered.names)(valve.m)
-    expected = 0.4 * np.split(valve.predicted - other.y, 2)[1]
-    assert mesh.name == "mesh"
-    np.testing.assert_allclose(mesh.rows[:, 0], expected, atol=1e-6)
-    assert 0.001 < np.abs(expected).max() < 2.0
+    away = np.split(valve.predicted - other.y, 2)[1]
+    assert 0.001 < np.abs(away).max() < 2.0
+    assert found.name == "mesh"
+    if source == "tetwild":  # does not refine the guide
+        np.testing.assert_allclose(found.rows[:, 0], away, atol=1e-6)
+        assert found.expected == 0.0
+    else:
+        np.testing.assert_allclose(found.expected, -away / 3.0, atol=1e-6)
+        np.testing.assert_allclose(found.rows[:, 0], away / 6.0, atol=1e-6)
+        errors = FrameErrors(SimpleNamespace(observation=lambda: seen), sources=(found,))
+        np.testing.assert_allclose(errors.measured().y, seen.y - away / 3.0, atol=1e-6)
 
 
 def test_a_law_without_an_equilibrium_is_reported(gentle, monkeypatch):

@@ -109,8 +109,8 @@ def test_a_wrong_jacobian_and_the_iteration_limit_end_as_values():
     estimate = by_hand(IteratedFilter(max_iterations=1))
     assert estimate.reason is Reason.MAX_ITERATIONS
     assert estimate.mean[0] == pytest.approx(22 / 9)
-    # From 22/9, where the variance is 1/13, a step of -0.030 lowers J by 13/2 0.030² = 0.006; the one
-    # after it, of -0.0006, by 2e-6: less than a thousandth, so that the limit ends a converged run.
+    # From 22/9, where the variance is 1/13, a step of -0.030 lowers J by 13/2 0.030² = 0.006; the
+    # one after it, of -0.0006, by 2e-6. That is negligible, so the limit ends a converged run.
     assert by_hand(tight(max_iterations=2)).reason is Reason.CONVERGED
 
 
