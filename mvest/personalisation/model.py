@@ -37,7 +37,7 @@ def with_pressures(case: ValveCase, settings: PersonaliseSettings) -> Personalis
 
 
 def contact_annulus(model: ClosureModel, annulus: FloatArray) -> FloatArray:
-    """Annulus of the contact valve ``(k, 3)`` mm from that of the observed valve ``(n, 3)``."""
+    """Annulus of the contact valve ``(..., k, 3)`` mm from the observed one ``(..., n, 3)``."""
     contact = model.contact_valve
     if contact is model.valve:
         return annulus

@@ -232,8 +232,8 @@ def sample_frames(case: ValveCase, valve: ClosedValve) -> FrameSamples | str:
     opened, closed = (roles.index(role) for role in (Role.REFERENCE, Role.CLOSED))
     moves, tips = samples.vertices, samples.tips
     rest = model.valve.surface.vertices[model.valve.annulus]
-    still = contact_annulus(model, rest)
-    moved = [contact_annulus(model, rest + own) for own in moves[:, closed][:, case.annulus]]
+    moved = contact_annulus(model, rest + moves[:, closed][:, case.annulus])
+    moved -= contact_annulus(model, rest)
     place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
 
     def from_tips(frame: int) -> FloatArray:
@@ -241,7 +241,7 @@ def sample_frames(case: ValveCase, valve: ClosedValve) -> FrameSamples | str:
         return np.asarray(np.moveaxis(ends, -1, 0) - tips[:, frame][:, chordae.end_tip])
 
     rest_lengths = rest_lengths_by_ends(case, from_tips(opened), from_tips(closed))
-    shape, annulus = geometry.shape(moves[:, opened]), geometry.annulus(np.stack(moved) - still)
+    shape, annulus = geometry.shape(moves[:, opened]), geometry.annulus(moved)
     parts = [shape, annulus, geometry.tips(tips[:, closed], rest_lengths)]
     change = geometry.change(at, RestVariation.summed(parts), states, TOLERANCE)
     if isinstance(change, str):

@@ -89,16 +89,18 @@ Extent = tuple[float, float, float, float]
 
 # -- files of the image step ----------------------------------------------------------------------
 def write_image_step(
-    detected: DetectedValve, folder: Path
+    detected: DetectedValve, folder: Path, draw: bool = True
 ) -> dict[str, tuple[Mapping[str, Any], ...]]:
-    """Draw and write a detected valve into an existing folder; returns `DetectedValve.details`."""
+    """Write and draw a detected valve into an existing folder; returns `DetectedValve.details`."""
     files = write_detected(detected, folder)
     volume, valve, closed = detected.volume, detected.valve, detected.frames.closed
     name, low = detected.case.name, detected.settings.min_confidence
-    drawn = {
-        "montage": montage_figure(volume, valve, title=name, closed=closed, low_confidence=low),
-        "measures_over_time": measures_figure(detected.rows, title=name, low_confidence=low),
-    }
+    drawn = {}
+    if draw:
+        drawn["montage"] = montage_figure(
+            volume, valve, title=name, closed=closed, low_confidence=low
+        )
+        drawn["measures_over_time"] = measures_figure(detected.rows, title=name, low_confidence=low)
     for key, figure in drawn.items():
         save_figure_with(folder / key, figure, called(volume))
     pictures = [{"file": f"{key}.png", "caption": CAPTIONS[key]} for key in drawn]

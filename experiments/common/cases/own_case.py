@@ -164,7 +164,7 @@ def run_volume(
     detected = find_valve(file, imaged, folder)
     for sentence in detected.sentences:
         say(sentence)
-    images = write_image_step(detected, folder)
+    images = write_image_step(detected, folder, draw=bool(values["figures"]))
     return run_case(values, personal, read_case(folder / CASE), images)
 
 

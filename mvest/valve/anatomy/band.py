@@ -176,31 +176,31 @@ class Band:
 
     def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
         """Thickness ``(k,)`` mm."""
-        return self.displaced(phi, s, self.given.surface.thickness)
-
-    def displaced(self, phi: FloatArray, s: FloatArray, vertices: FloatArray) -> FloatArray:
-        """Positions ``(k, 3)`` of material points while the surface's vertices are elsewhere."""
-        return _mean(self.locate(phi, s), self.given.surface, vertices)
+        surface = self.given.surface
+        return _mean(self.locate(phi, s), surface, surface.thickness)
 
     def annulus_positions(self, phi: FloatArray, annulus: FloatArray) -> FloatArray:
-        """Positions ``(k, 3)`` of annulus points, given those of the valve's annulus vertices.
+        """Positions ``(..., k, 3)`` of annulus points, given those of the valve's annulus vertices.
 
         Parameters
         ----------
         phi : (k,) degrees
         annulus : ndarray
-            ``(a, 3)`` mm, of the vertices ``valve.annulus``.
+            ``(..., a, 3)`` mm, of the vertices ``valve.annulus``.
         """
-        vertices = np.array(self.given.surface.vertices)
-        vertices[self.given.annulus] = annulus
-        return self.displaced(phi, np.zeros(len(phi)), vertices)
+        vertices = self.given.surface.vertices
+        whole = np.broadcast_to(vertices, (*annulus.shape[:-2], *vertices.shape)).copy()
+        whole[..., self.given.annulus, :] = annulus
+        triangle, weights = self.locate(phi, np.zeros(len(phi)))
+        corners = whole[..., self.given.surface.triangles[triangle], :]
+        return np.asarray(np.einsum("kc,...kci->...ki", weights, corners))
 
     def valve(self, columns: int, rows: int) -> Valve:
         """The valve, its chordae and motion on a grid of ``columns x rows`` vertices."""
         given, motion = self.given, self.given.motion
 
         def attached(phi: FloatArray) -> tuple[FloatArray, Chordae, Motion]:
-            annulus = np.stack([self.annulus_positions(phi, frame) for frame in motion.annulus])
+            annulus = self.annulus_positions(phi, motion.annulus)
             moved = Motion(motion.phase, annulus, motion.papillary_tips)
             return given.papillary_tips, given.chordae, moved
 
