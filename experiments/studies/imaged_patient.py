@@ -226,12 +226,12 @@ def _segmented(
     length, n = VOXELS_CORRELATED * voxel_mm, true.layout.size
     factor = SpatialCorrelation(true.vertices[frames.open], length).factor
 
-    def errors(samples: int) -> tuple[FloatArray, FloatArray]:
-        white = rng.standard_normal((samples, count, n, 3))
-        tips = rng.standard_normal((samples, count, 2, 3))
-        return std * np.einsum("nk,sfkd->sfnd", factor, white), std * tips
+    def errors(samples: int, shown: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        white = rng.standard_normal((samples, count, n, 3))[:, shown]
+        tips = rng.standard_normal((samples, count, 2, 3))[:, shown]
+        return std * (factor @ white), std * tips
 
-    (leaflets,), (tips,) = errors(1)
+    (leaflets,), (tips,) = errors(1, range(count))
     seen = replace(
         true,
         vertices=true.vertices + leaflets,
@@ -239,7 +239,7 @@ def _segmented(
         std_mm=np.full(n, std),
         correlation_length_mm=length,
     )
-    vertices, tip_errors = (each[:, frames.in_order] for each in errors(SAMPLES))
+    vertices, tip_errors = errors(SAMPLES, frames.in_order)
     return seen, ErrorSamples(vertices, tip_errors)
 
 
