@@ -103,19 +103,16 @@ class TissueSheet:
 
     def place(self, frame: int, seeds: FloatArray, apex: FloatArray) -> tuple[FloatArray, ...]:
         """Positions ``(n, 3)`` and ``|normal . line of sight|`` ``(n,)``."""
-
-        def at(grid: FloatArray) -> FloatArray:
-            x, y, (a, b, c, d) = _in_cells(grid, seeds)
-            first = (1 - x) * (1 - y) * a + (1 - x) * y * b
-            return np.asarray(first + (x * (1 - y) * c + x * y * d))
-
         points = self.points[frame]
-        on_grid, normal = at(points), at(normals(points))
+        grid = np.concatenate([points, normals(points), self.thickness[..., None]], axis=-1)
+        x, y, (a, b, c, d) = _in_cells(grid, seeds)
+        here = (1 - x) * (1 - y) * a + (1 - x) * y * b + (x * (1 - y) * c + x * y * d)
+        on_grid, normal, thickness = np.split(here, [3, 6], axis=1)
         size = np.maximum(np.sqrt(_sum(normal * normal)), 1e-9)
         sight = on_grid - apex
         cosine = np.abs(_sum(sight * normal / size[:, None]))
         cosine /= np.maximum(np.sqrt(_sum(sight * sight)), 1e-9)
-        away = normal / size[:, None] * at(self.thickness)[:, None] * seeds[:, 2:]
+        away = normal / size[:, None] * thickness * seeds[:, 2:]
         return on_grid + away, np.minimum(cosine, 1.0)
 
 
