@@ -141,12 +141,16 @@ def test_a_volume_unlike_those_of_training_is_named_and_its_errors_are_wider(
 
     monkeypatch.setattr("experiments.common.cases.own_case.run_case", not_here)
     seen, measured = sequence().confidence, run.model.accuracy
-    for like_from, widening in ((seen - 0.05, (1.0, 0.0)), (seen + 0.05, (1.0, 7.0))):
+    for figures, like_from, widening in (
+        (True, seen - 0.05, (1.0, 0.0)),
+        (False, seen + 0.05, (1.0, 7.0)),
+    ):
         run.model.accuracy = replace(measured, like_from=like_from, widening=widening)
-        assert run("figures=false", "tracking.enabled=false")[0] == 2
+        assert run(f"figures={figures}", "tracking.enabled=false")[0] == 2
     (like, images), (unlike, other) = personalised
     assert like.name == f"volume {sha256_of(volume)[:12]}"
     assert [row["file"] for row in images["pictures"]] == ["montage.png", "measures_over_time.png"]
+    assert not other["pictures"]
     (step,), (unlike_step,) = images["image_step"], other["image_step"]
     assert len(images["image_frames"]) == len(step["confidence"]) == 4
     assert (step["open_frame"], step["shape"], step["unlike"]) == (0, [4, 20, 20, 20], "")
