@@ -91,7 +91,10 @@ Extent = tuple[float, float, float, float]
 def write_image_step(
     detected: DetectedValve, folder: Path, draw: bool = True
 ) -> dict[str, tuple[Mapping[str, Any], ...]]:
-    """Write and draw a detected valve into an existing folder; returns `DetectedValve.details`."""
+    """Write a detected valve into an existing folder, pictures only if ``draw``.
+
+    Returns `DetectedValve.details`.
+    """
     files = write_detected(detected, folder)
     volume, valve, closed = detected.volume, detected.valve, detected.frames.closed
     name, low = detected.case.name, detected.settings.min_confidence
