@@ -1,6 +1,7 @@
 """Which published results are stale; and renewing them makes these and no others."""
 
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -130,9 +131,9 @@ def test_an_interrupt_leaves_what_is_finished(mvest, monkeypatch):
     real = sweep.run_jobs
 
     def interrupted(*given):
-        ends = real(*given)
-        yield next(ends)
-        raise KeyboardInterrupt
+        with closing(real(*given)) as ends:  # its workers stop, as they do for a user's interrupt
+            yield next(ends)
+            raise KeyboardInterrupt
 
     monkeypatch.setattr(sweep, "run_jobs", interrupted)
     assert mvest(TABLE, "--run")[0] == 130
