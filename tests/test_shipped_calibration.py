@@ -37,13 +37,14 @@ GUARDS = {"volume": "volume"}
 """Way of a geometry -> a run of ``golden.json``."""
 
 
-def example(way: str) -> dict[str, list[float]]:
+def example(way: str) -> dict[str, tuple[float, ...]]:
     """The uncalibrated numbers of ``golden.json``."""
     values = json.loads(GOLDEN.read_text(encoding="utf-8"))[GUARDS[way]]["values"]
-    return values.get("uncalibrated", values["estimate"])
+    found = values.get("uncalibrated", values["estimate"])
+    return {name: tuple(pair) for name, pair in found.items()}
 
 
-def changed(calibration: Calibration, now: dict[str, list[float]]) -> list[str]:
+def changed(calibration: Calibration, now: dict[str, tuple[float, ...]]) -> list[str]:
     """The moduli whose estimate or standard deviation is not what it was."""
     return [
         name
@@ -63,11 +64,11 @@ def test_the_shipped_calibration_is_that_of_this_estimator(path: Path) -> None:
 
 
 def test_another_estimate_of_the_example_is_seen() -> None:
-    now = {"E_f.anterior": [5.0, 1.0], "E_f.posterior": [2.0, 0.4]}
+    now = {"E_f.anterior": (5.0, 1.0), "E_f.posterior": (2.0, 0.4)}
     known = Calibration.model_construct(parameters=tuple(now), example=now)
     assert changed(known, now) == []
-    assert changed(known, now | {"E_f.posterior": [2.0, 0.41]}) == ["E_f.posterior"]
-    assert changed(known, now | {"E_f.anterior": [5.00001, 1.0]}) == ["E_f.anterior"]
+    assert changed(known, now | {"E_f.posterior": (2.0, 0.41)}) == ["E_f.posterior"]
+    assert changed(known, now | {"E_f.anterior": (5.00001, 1.0)}) == ["E_f.anterior"]
 
 
 def test_patients_are_estimated_as_volumes_of_users_are() -> None:
@@ -86,8 +87,9 @@ def ship() -> None:
     CALIBRATIONS.mkdir(exist_ok=True)
     for way, table in TABLES.items():
         known = calibration_of(ROOT / "results", table)
+        now = {name: example(way)[name] for name in known.parameters}
         path = CALIBRATIONS / f"{way}.json"
-        print(write_calibration(path, known.model_copy(update={"example": example(way)})))
+        print(write_calibration(path, known.model_copy(update={"example": now})))
 
 
 if __name__ == "__main__":
