@@ -106,7 +106,7 @@ PATIENT = ("experiment=patients", "patient=normal_small", "hydra.mode=RUN")
 VOLUME = ("experiment=volume", "volume=examples/volume.seq.nrrd", "imaged.pressure_mmHg=120")
 FEWER = ("imaged.error_samples=20", "personal.nuisance_geometry=null", "personal.moduli_only=false")
 OWN = ("experiment=own_valve", "case=examples/case")
-# An unstructured mesh, this experiment's default, is made by a mesher that is not deterministic.
+# The default rounds the columns up to a multiple of the leaflets.
 STRUCTURED = "personal.mesh.source=structured"
 
 RUNS = {
