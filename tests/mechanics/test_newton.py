@@ -162,21 +162,35 @@ def test_times_must_increase_from_zero(times):
         sheet(times=times)
 
 
-def test_an_equilibrium_that_is_not_found_is_tried_again_after_a_rest(monkeypatch):
+def cantilever(**options):
+    """A strip under constant pressure: two time steps, then its equilibrium."""
     mesh = block("hex18", (4, 2, 1), (20.0, 10.0, 1.3))
     nodes, law = mesh.nodes, BiotLaw.of((MATERIALS["A"],))
     fixed = np.flatnonzero(nodes[:, 0] == 0)
     faces = outer_faces(mesh.elements, "hex18")
     under = faces[np.all(nodes[faces][:, :, 2] == 0, axis=1)]
+    system = System(Solid(mesh, law), pressure=PressureLoad(under, "quad9"), fixed_nodes=fixed)
+    loads = Loads(pressure=2e-4, fixed=nodes[fixed])
+    parameters = [Parameter("pressure_scale", 1.0)]
+    steps = [Step(0.01), Step(0.02), Step(1.0, static=True)]
+    return simulate(system, lambda t: loads, steps, parameters=parameters, **options)
 
-    def run(**options):
-        system = System(Solid(mesh, law), pressure=PressureLoad(under, "quad9"), fixed_nodes=fixed)
-        loads = Loads(pressure=2e-4, fixed=nodes[fixed])
-        parameters = [Parameter("pressure_scale", 1.0)]
-        steps = [Step(0.01), Step(0.02), Step(1.0, static=True)]
-        return simulate(system, lambda t: loads, steps, parameters=parameters, **options)
 
-    undisturbed = run(final_only=True)
+def test_a_step_of_no_interest_is_halved_soon_and_the_last_half_is_solved_patiently(monkeypatch):
+    newton = NewtonSettings(max_halvings=1, path_tolerance=1e-9)
+    expected = cantilever(final_only=True, newton=newton)
+    monkeypatch.setattr(integrate, "PATIENCE", 1)
+    hasty, all_frames = (cantilever(final_only=only, newton=newton) for only in (True, False))
+    assert [r.halvings for r in hasty.records] == [1, 1, 1, 1, 0]
+    assert [r.halvings for r in all_frames.records] == [0, 0, 0]
+    np.testing.assert_allclose(hasty.frames[-1], expected.frames[-1], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        hasty.sensitivities[-1], expected.sensitivities[-1], rtol=0, atol=1e-6
+    )
+
+
+def test_an_equilibrium_that_is_not_found_is_tried_again_after_a_rest(monkeypatch):
+    undisturbed = cantilever(final_only=True)
     true_step, refused = integrate._Stepper._step, []
 
     def step(self, state, end, dt, static):
@@ -188,7 +202,7 @@ def test_an_equilibrium_that_is_not_found_is_tried_again_after_a_rest(monkeypatc
     monkeypatch.setattr(integrate._Stepper, "_step", step)
     for final_only in (True, False):
         refused.clear()
-        rested = run(final_only=final_only)
+        rested = cantilever(final_only=final_only)
         assert rested.converged
         assert len(rested.times) == 4
         # Three steps of twice the length each, then the equilibrium.
