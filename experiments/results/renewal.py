@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -94,6 +94,18 @@ class Configured:
         name = self.values.get("name", self.stem)
         every = records_of(results, self.table).records
         return {key: record for key, record in every.items() if record.experiment == name}
+
+    def of_today(self, records: Mapping[str, Record], jobs: Sequence[Request]) -> set[str]:
+        """Names of the records that today's jobs would give again."""
+        named = {
+            job.config_hash if self.group == "sweep" else str(job.publish_as): job.config_hash
+            for job in jobs
+        }
+        return {
+            name
+            for name, record in records.items()
+            if is_present(record) and named.get(name) == record.provenance.config_hash
+        }
 
     def plan(self, results: Path) -> Plan:
         """All its jobs, composed; raises Hydra's and OmegaConf's errors, or an `MvestError`."""
@@ -198,14 +210,8 @@ def status_of(one: Configured, results: Path) -> Status:
     """
     records = one.records(results)
     old = {name for name, record in records.items() if not is_present(record)}
-    present: set[str] = set()
-    if len(old) < len(records):
-        for job in one.plan(results).jobs:
-            name = job.config_hash if one.group == "sweep" else str(job.publish_as)
-            kept = records.get(name)
-            if kept is not None and kept.provenance.config_hash == job.config_hash:
-                present.add(name)
-    present -= old
+    jobs = one.plan(results).jobs if len(old) < len(records) else ()
+    present = one.of_today(records, jobs)
     others = records.keys() - old - present
     reasons = (("numbers", old), ("configuration", others))
     return Status(
@@ -245,8 +251,8 @@ def run_results(studies: Sequence[str], run: bool, shard: str, results: Path) ->
 def renew(one: Configured, results: Path, take: slice = slice(None)) -> int:
     """Make the share ``take`` of what is missing or stale; returns how many jobs have no estimate.
 
-    Finished jobs are published, also after an interruption. When all are, records that belong to
-    no job any more are removed.
+    Finished jobs are published, also after an interruption. As soon as one is, the stale records
+    are removed: a table of both would be a result of neither.
 
     Raises an `MvestError` if a job cannot be run.
     """
@@ -257,13 +263,15 @@ def renew(one: Configured, results: Path, take: slice = slice(None)) -> int:
     plan = replace(plan, before={**plan.before, **known})
     left = {job.config_hash for job in plan.to_run} - known.keys()
     todo = [job for job in share(one, plan.jobs, take) if job.config_hash in left]
-    found = run_plan(plan, todo)
+    try:
+        found = run_plan(plan, todo)
+    finally:
+        now = one.records(results)
+        today = one.of_today(now, plan.jobs)
+        if one.group != "sweep" and today:
+            unpublish(load_study(plan.common["study"]), results, one.table, now.keys() - today)
     hashes = {job.config_hash for job in todo}
     lost = [r for r in found.records if not r.converged and r.provenance.config_hash in hashes]
-    if one.group != "sweep":
-        names, now = {str(job.publish_as) for job in plan.jobs}, one.records(results)
-        if names <= now.keys() and all(is_present(now[name]) for name in names):
-            unpublish(load_study(plan.common["study"]), results, one.table, now.keys() - names)
     return len(lost)
 
 

@@ -127,7 +127,7 @@ def test_shards_end_in_one_sweep(mvest):
     assert runs() == 4
 
 
-def test_an_interrupt_leaves_what_is_finished(mvest, monkeypatch):
+def interrupt_after_one(monkeypatch):
     real = sweep.run_jobs
 
     def interrupted(*given):
@@ -136,6 +136,26 @@ def test_an_interrupt_leaves_what_is_finished(mvest, monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(sweep, "run_jobs", interrupted)
+    return real
+
+
+def test_new_records_are_never_published_beside_stale_ones(mvest, monkeypatch):
+    assert mvest(TABLE, "--run")[0] == 0
+    for name in names():
+        changed(name, config_hash="0" * 64, numbers={"twin": NUMBERS["twin"] - 1})
+    assert found() == (0, 0, 5, "numbers")
+    engine._idle.clear()
+    interrupt_after_one(monkeypatch)
+    for place in Path("outputs").glob("*/*/done"):
+        place.unlink()
+    assert mvest(TABLE, "--run")[0] == 130
+    present, missing, stale, _ = found()
+    assert (present + missing, stale) == (5, 0)
+    assert present >= 1
+
+
+def test_an_interrupt_leaves_what_is_finished(mvest, monkeypatch):
+    real = interrupt_after_one(monkeypatch)
     assert mvest(TABLE, "--run")[0] == 130
     done = {path: path.stat().st_mtime_ns for path in Path("outputs").glob("*/*/done")}
     assert found()[0] == len(done) >= 1
