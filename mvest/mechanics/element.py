@@ -84,6 +84,27 @@ def enhanced_strain(
 
 
 @nb.njit(cache=True, error_model="numpy")
+def volume_change(green: FloatArray, direction: FloatArray) -> FloatArray:
+    """Change ``(e, q)`` of det C, over det C, by an enhanced strain of one.
+
+    The direction D is of rank one, so det C is linear in the enhanced strain (matrix determinant
+    lemma): ``det(C + 2 b D) = (1 + 2 b C^-1 : D) det C``.
+    """
+    out = np.empty(green.shape[:2])
+    for e in range(len(green)):
+        for q in range(green.shape[1]):
+            g, d = green[e, q], direction[e, q]
+            c0, c1, c2 = 1.0 + 2.0 * g[0], 1.0 + 2.0 * g[1], 1.0 + 2.0 * g[2]
+            first = c1 * c2 - g[3] * g[3]
+            fifth, last = g[3] * g[5] - c1 * g[4], g[3] * g[4] - c2 * g[5]
+            det = c0 * first + g[4] * fifth + g[5] * last
+            normal = first * d[0] + (c0 * c2 - g[4] * g[4]) * d[1] + (c0 * c1 - g[5] * g[5]) * d[2]
+            shear = (g[4] * g[5] - c0 * g[3]) * d[3] + fifth * d[4] + last * d[5]
+            out[e, q] = 2.0 * (normal + shear) / det
+    return out
+
+
+@nb.njit(cache=True, error_model="numpy")
 def alpha_change(
     direction: FloatArray,
     polynomials: FloatArray,

@@ -12,8 +12,10 @@ Enhanced strains. Solid-shells add ``E = E(u) + M alpha`` with ``M = d p^T``: th
 ``d = (det J0 / det J) (G^3 x G^3)`` (G^3 the contravariant thickness vector at the centre) times
 the element's polynomials p. The parameters alpha of an element solve ``int M^T S dV = 0``. They are
 eliminated inside the element by Newton's method at every evaluation, so that its energy depends on
-nodal positions only (the condensed tangent is the Schur complement). The modes integrate to zero
-against constant stress: the patch test holds. With the corotational law the strain is the linear
+nodal positions only (the condensed tangent is the Schur complement). A step of this method keeps a
+quarter of det C at every point. Without this bound, an element stretched to l > 1.5 across its
+thickness would overshoot to a negative C33 = l^2 (3 - 2 l), which no step leads back from (the
+uniaxial Biot law). The modes integrate to zero against constant stress: the patch test holds. With the corotational law the strain is the linear
 one in a frame that rotates with the element and replaces F.
 """
 
@@ -32,6 +34,7 @@ from mvest.mechanics.element import (
     internal_forces,
     strain_derivative,
     strains,
+    volume_change,
 )
 from mvest.mechanics.law import Law, Points
 from mvest.mechanics.law.biot import BiotLaw
@@ -42,9 +45,13 @@ announce_compilation()
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 """Tensor entries of the components of a six-vector."""
-ENHANCED_ITERATIONS = 12
+ENHANCED_ITERATIONS = 20
 ENHANCED_TOLERANCE = 1e-11
 """Size of the last alpha correction (strain) at which the elimination stops."""
+LARGEST_LOSS = 0.75
+"""Largest share of det C that a point may lose in one step of the elimination."""
+THINNEST = 1e-2
+"""Smallest det C, over that without enhanced strain, at which an elimination may start."""
 LINEAR = 1e-7
 """Alpha corrections below this size change the stress linearly and the tangent negligibly."""
 
@@ -118,7 +125,11 @@ class Solid:
         if self.n_modes == 0:
             stress, tangent = self.law.response(Points(green_u, region, previous, rate))
             return SolidState(green_u, stress, tangent, self.enhanced_parameters, f)
+        volume = volume_change(green_u, self.direction)
         alpha = self.enhanced_parameters
+        # What another state has left may be inadmissible here; zero always is admissible.
+        thin = self._share(alpha, volume).min(axis=1, keepdims=True) < THINNEST
+        alpha = np.where(thin, 0.0, alpha)
         for _ in range(ENHANCED_ITERATIONS):
             green = enhanced_strain(green_u, self.direction, self.polynomials, alpha)
             stress, tangent = self.law.response(Points(green, region, previous, rate))
@@ -126,16 +137,24 @@ class Solid:
             size = float(np.abs(step).max(initial=0.0))
             if not np.isfinite(size) or size < ENHANCED_TOLERANCE:
                 break
-            # An enhanced strain beyond +-0.2 per iteration is far outside the law's small strains.
-            alpha = alpha + np.clip(step, -0.2, 0.2)
+            left = self._share(alpha, volume)
+            loss = (1.0 - self._share(alpha + step, volume) / left).max(axis=1, keepdims=True)
+            alpha = alpha + LARGEST_LOSS / np.maximum(loss, LARGEST_LOSS) * step
             if size < LINEAR:
                 more = enhanced_strain(np.zeros_like(green), self.direction, self.polynomials, step)
                 green += more
                 stress += np.einsum("eqij,eqj->eqi", tangent, more)
                 break
+        else:
+            # No equilibrium within some element: the line search rejects such positions.
+            stress = np.full_like(stress, np.nan)
         if np.isfinite(alpha).all():
             self.enhanced_parameters = alpha
         return SolidState(green, stress, tangent, alpha, f)
+
+    def _share(self, alpha: FloatArray, volume: FloatArray) -> FloatArray:
+        """det C ``(e, q)`` over that without enhanced strain; ``volume`` as `volume_change`."""
+        return 1.0 + alpha @ self.polynomials.T * volume
 
     def forces(self, state: SolidState) -> FloatArray:
         """Internal forces ``(e, k, 3)`` N."""

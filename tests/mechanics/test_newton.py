@@ -225,3 +225,35 @@ def test_iterates_that_run_away_and_detection_without_memory_fail_the_step(monke
     monkeypatch.setattr(integrate, "RUNAWAY", 1e-4)
     halving = NewtonSettings(max_halvings=0)
     assert sheet(newton=halving).reason is StepReason.NO_CONVERGENCE
+
+
+def bent_and_thickened(mesh, curvature=0.6, thickness=2.0):
+    """Positions of a block of side 2 and thickness 1, bent to a curvature (1/mm) and thickened."""
+    turn, z = curvature * (mesh.nodes[:, 0] - 1.0), thickness * (mesh.nodes[:, 2] - 0.5)
+    radius = 1.0 / curvature - z
+    across = 1.0 / curvature - radius * np.cos(turn)
+    return np.stack([radius * np.sin(turn), mesh.nodes[:, 1], across], axis=1)
+
+
+@pytest.mark.parametrize("start", [0.0, -0.45, 1.0])
+def test_enhanced_strains_are_found_in_elements_that_are_much_thicker(start):
+    # At twice the thickness a full step of Newton's method leads to a negative C33, where it stays;
+    # and what an earlier state has left need not be admissible here.
+    mesh = block("hex18", (1, 1, 1), (2.0, 2.0, 1.0), fibre=(0.8, 0.6, 0))
+    solid = Solid(mesh, BiotLaw.of((MATERIALS["C"],)))
+    solid.enhanced_parameters += start
+    state = solid.evaluate(bent_and_thickened(mesh), solid.initial_strain(), 0.0)
+    stress = np.einsum("eqi,eqi->eq", solid.direction, state.stress)
+    balance = np.einsum("eq,eq,qm->em", solid.volumes, stress, solid.polynomials)
+    assert np.abs(balance).max() < 1e-9 * np.abs(solid.volumes * stress).sum()
+    assert np.abs(state.alpha).max() > 1.0
+
+
+def test_positions_without_equilibrium_in_an_element_are_inadmissible(monkeypatch):
+    mesh = block("hex18", (1, 1, 1), (2.0, 2.0, 1.0), fibre=(0.8, 0.6, 0))
+    solid = Solid(mesh, BiotLaw.of((MATERIALS["C"],)))
+    x, strain = bent_and_thickened(mesh), solid.initial_strain()
+    assert np.isfinite(solid.evaluate(x, strain, 0.0).stress).all()
+    monkeypatch.setattr("mvest.mechanics.solid.ENHANCED_ITERATIONS", 2)
+    solid.reset()
+    assert np.isnan(solid.evaluate(x, strain, 0.0).stress).all()
