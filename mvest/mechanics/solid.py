@@ -15,8 +15,9 @@ eliminated inside the element by Newton's method at every evaluation, so that it
 nodal positions only (the condensed tangent is the Schur complement). A step of this method keeps a
 quarter of det C at every point. Without this bound, an element stretched to l > 1.5 across its
 thickness would overshoot to a negative C33 = l^2 (3 - 2 l), which no step leads back from (the
-uniaxial Biot law). The modes integrate to zero against constant stress: the patch test holds. With the corotational law the strain is the linear
-one in a frame that rotates with the element and replaces F.
+uniaxial Biot law). The modes integrate to zero against constant stress: the patch test holds. With
+the corotational law the strain is the linear one in a frame that rotates with the element and
+replaces F.
 """
 
 from dataclasses import dataclass, replace
@@ -153,7 +154,7 @@ class Solid:
         return SolidState(green, stress, tangent, alpha, f)
 
     def _share(self, alpha: FloatArray, volume: FloatArray) -> FloatArray:
-        """det C ``(e, q)`` over that without enhanced strain; ``volume`` as `volume_change`."""
+        """The det C ``(e, q)`` over that without enhanced strain, from `volume_change`."""
         return 1.0 + alpha @ self.polynomials.T * volume
 
     def forces(self, state: SolidState) -> FloatArray:
