@@ -5,6 +5,8 @@ The generic guess is the literature's value; the prior is this value with its in
 
 from __future__ import annotations
 
+import itertools
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -117,6 +119,9 @@ def share_bounds(inside: int, n: int) -> tuple[float, float]:
     return float(found[0]), float(found[1])
 
 
+ACROSS = 4
+"""Panels of `moduli_figure` side by side, at most."""
+
 VERDICTS = (TRUSTWORTHY, DOUBTFUL, NONE)
 COLOURS = {TRUSTWORTHY: "#2b6ca3", DOUBTFUL: "#d08a2e", NONE: "#a9a9a9", "": "0.2"}
 """Of verdicts in figures."""
@@ -218,39 +223,56 @@ def verdict_table(estimates: Sequence[EstimateRecord]) -> Table:
 def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure:
     """Estimates over their truths with 95 % intervals, in the colour of their verdicts.
 
-    Each modulus has a panel, and each group a band in which truths rise downwards.
+    A panel for each group and modulus, with the line of equality and the generic guess. Estimates
+    whose verdict is ``none`` are hollow; a panel's title counts those without a number.
 
     ``groups``: name -> moduli with known truths, each with its verdict in a word.
     """
     from mvest.reporting.figures import panels
 
     names = list(dict.fromkeys(own.name for each in groups.values() for own, _ in each))
-    most = max((len(each) for each in groups.values()), default=0) / max(len(names), 1)
-    height = len(groups) * max(0.6, 0.11 * most) + 1.2
-    drawn, (grid,) = panels(1, max(len(names), 1), height, sharey=True)
-    for axes, name in zip(grid, names, strict=False):
-        for k, each in enumerate(groups.values()):
-            rows = [(own, trust) for own, trust in each if own.name == name]
-            rows.sort(key=lambda row: row[0].truth or 0.0)
-            for j, (own, trust) in enumerate(rows):
-                at, colour = k + 0.8 * ((j + 0.5) / len(rows) - 0.5), COLOURS[trust]
-                numbers = np.array([own.low, own.estimate, own.high, own.prior_mean], dtype=float)
-                low, middle, high, guess = numbers / float(own.truth or np.nan)
-                face = "white" if trust == NONE else colour
-                axes.plot(guess, at, "|", color="0.6", ms=5, zorder=1)
-                axes.plot([low, high], [at, at], color=colour, lw=1.3)
-                axes.plot(middle, at, "o", color=colour, mfc=face, ms=3.5)
-                if own.estimate is None:
-                    axes.text(1.0, at, "no estimate", fontsize=7, ha="center", va="center")
-        axes.axvline(1.0, color="0.3", lw=0.8, zorder=0)
-        axes.set_xscale("log")
-        axes.set_xticks([0.5, 0.7, 1.0, 1.5, 2.0], labels=["0.5", "0.7", "1", "1.5", "2"])
-        axes.minorticks_off()
-        axes.set_xlabel(f"{name.replace('.', ' ')}, estimate / truth")
-    grid[0].set_yticks(range(len(groups)), labels=list(groups))
-    grid[0].invert_yaxis()
+    bands = [list(groups)[k : k + ACROSS] for k in range(0, len(groups), ACROSS)]
+    rows, columns = max(len(bands) * len(names), 1), max(map(len, bands), default=1)
+    drawn, grid = panels(rows, columns, 2.3 * rows + 0.4, sharex="row", sharey="row")
+    for axes in grid.flat:
+        axes.set_visible(False)
+    for j, (band, name) in enumerate(itertools.product(bands, names)):
+        for axes, group in zip(grid[j], band, strict=False):
+            axes.set_visible(True)
+            _draw_moduli(axes, [row for row in groups[group] if row[0].name == name])
+            lost = sum(own.name == name and own.estimate is None for own, _ in groups[group])
+            lines = [textwrap.fill(group, 26), *([f"{lost} without"] if lost else [])]
+            axes.set_title("\n".join(lines), fontsize=8)
+        grid[j, 0].set_ylabel(f"{name.replace('.', ' ')} [MPa]")
+    for axes in grid[-1]:
+        axes.set_xlabel("truth [MPa]")
     for trust in VERDICTS:
-        grid[-1].plot([], [], "o-", color=COLOURS[trust], ms=4, lw=1.3, label=trust)
-    grid[-1].plot([], [], "|", color="0.5", ms=8, label=GENERIC)
-    grid[-1].legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        face = "white" if trust == NONE else COLOURS[trust]
+        grid[0, 0].plot([], [], "o-", color=COLOURS[trust], mfc=face, ms=4, lw=1.0, label=trust)
+    grid[0, 0].plot([], [], "--", color="0.5", lw=0.9, label=GENERIC)
+    drawn.legend(fontsize=8, loc="outside upper center", ncols=len(VERDICTS) + 1, frameon=False)
     return drawn
+
+
+def _draw_moduli(axes: Any, moduli: Sequence[tuple[Unknown, str]]) -> None:
+    """Draw one modulus of several valves over its truth, on logarithmic axes."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    for own, trust in moduli:
+        if own.estimate is None:
+            continue
+        colour, face = COLOURS[trust], "white" if trust == NONE else COLOURS[trust]
+        axes.plot([own.truth, own.truth], [own.low, own.high], color=colour, lw=0.8, alpha=0.6)
+        axes.plot(own.truth, own.estimate, "o", color=colour, mfc=face, ms=3.0)
+    for guess in {own.prior_mean for own, _ in moduli} - {None}:
+        axes.axhline(guess, color="0.5", lw=0.9, ls="--", zorder=0)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    ends = [own.truth for own, _ in moduli if own.truth]
+    if ends:
+        whole = [min(ends) / 1.15, max(ends) * 1.15]
+        axes.plot(whole, whole, color="0.3", lw=0.8, zorder=0)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.set_minor_formatter(NullFormatter())
