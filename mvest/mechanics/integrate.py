@@ -48,10 +48,6 @@ at most one more iteration."""
 DERIVATIVES = 1e-11
 """Estimated relative error of derivatives."""
 
-PATIENCE = 20
-"""Iterations after which a time step is halved, if only the final equilibrium is needed. A long
-search ends far from the motion: one valve closed in 26 s, and in 82 s with 60 iterations."""
-
 SETTLINGS = 2
 """Largest number of rests before an equilibrium that is not found at once."""
 SETTLING_STEPS = 3
@@ -214,7 +210,6 @@ class _Stepper:
         self.records: list[StepRecord] = []
         self.last_only = False
         self.passing = False  # whether only later steps are of interest
-        self._patience = newton.max_iterations
         self._pairs: ContactPairs | None = None
         self._detect = False  # whether collision detection always runs
 
@@ -226,19 +221,16 @@ class _Stepper:
         time = start
         while pending:
             end, level = pending[-1]
-            last, most = level >= self.newton.max_halvings, self.newton.max_iterations
-            self._patience = min(PATIENCE, most) if self.passing and not last else most
             try:
                 state = self._try(state, end, end - time, step.static, level)
             except _StepError:
-                if last:
+                if level >= self.newton.max_halvings:
                     raise
                 pending.append((0.5 * (time + end), level + 1))
                 pending[-2] = (end, level + 1)
                 continue
             pending.pop()
             time = end
-        self._patience = self.newton.max_iterations
         return state
 
     def _settle(self, state: _State, start: float, time: float) -> _State:
@@ -340,13 +332,13 @@ class _Stepper:
 
         current = evaluate(x)
         residuals = [float(np.linalg.norm(current.residual)) / current.scale]
-        for iteration in range(self._patience + 1):
+        for iteration in range(newton.max_iterations + 1):
             if not np.isfinite(residuals[-1]):
                 raise _StepError(StepReason.NO_CONVERGENCE)
             converged = residuals[-1] <= tolerance
             if converged and self.passing:
                 return _Solved(x, current, residuals, pairs)
-            if iteration == self._patience and not converged:
+            if iteration == newton.max_iterations and not converged:
                 break
             try:
                 # A converged state keeps the last factor, unless derivatives need a new one.

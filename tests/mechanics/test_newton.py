@@ -176,19 +176,6 @@ def cantilever(**options):
     return simulate(system, lambda t: loads, steps, parameters=parameters, **options)
 
 
-def test_a_step_of_no_interest_is_halved_soon_and_the_last_half_is_solved_patiently(monkeypatch):
-    newton = NewtonSettings(max_halvings=1, path_tolerance=1e-9)
-    expected = cantilever(final_only=True, newton=newton)
-    monkeypatch.setattr(integrate, "PATIENCE", 1)
-    hasty, all_frames = (cantilever(final_only=only, newton=newton) for only in (True, False))
-    assert [r.halvings for r in hasty.records] == [1, 1, 1, 1, 0]
-    assert [r.halvings for r in all_frames.records] == [0, 0, 0]
-    np.testing.assert_allclose(hasty.frames[-1], expected.frames[-1], rtol=0, atol=1e-8)
-    np.testing.assert_allclose(
-        hasty.sensitivities[-1], expected.sensitivities[-1], rtol=0, atol=1e-6
-    )
-
-
 def test_an_equilibrium_that_is_not_found_is_tried_again_after_a_rest(monkeypatch):
     undisturbed = cantilever(final_only=True)
     true_step, refused = integrate._Stepper._step, []
