@@ -3,8 +3,8 @@
 A simulated valve, open and closed under 120 mmHg on a finer mesh than an estimation uses. Its
 closed frame is seen with errors of 0.5 mm that are alike over 10 mm. The true moduli are the
 generic ones times 1.2 and 0.8. They are written beside the folder (``FOLDER_truth.txt``), where no
-estimation looks. Only the least is written into it: two surfaces, the papillary tips, the pressures
-and the size of the errors; whoever reads the case derives the rest.
+estimation looks. The folder has two surfaces, the papillary tips, the chordae, the pressures and
+the size of the errors; whoever reads the case derives the rest.
 """
 
 import sys
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import mvest
+from mvest.cases.tissue import write_chordae
 from mvest.exchange.surfaces import write_surface
 from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation
 
@@ -31,6 +32,7 @@ frames:
    papillary_tips: {tips}}}
 - {{name: closed, time: 0.35, role: closed, surface: closed.vtp, pressure: 120,
    papillary_tips: {tips}}}
+chordae: {{file: chordae.csv, families: [{families}]}}
 observation: {{std_mm: 0.5, correlation_length_mm: 10.0}}
 """
 
@@ -56,8 +58,10 @@ def make_case(folder):
     for name, x in zip(("open", "closed"), frames, strict=True):
         label = {"region": surface.region}
         write_surface(folder / f"{name}.vtp", x, surface.triangles, None, label)
-    tips = valve.papillary_tips.round(3).tolist()
-    (folder / "case.yaml").write_text(TEXT.format(tips=tips), encoding="utf-8")
+    write_chordae(folder / "chordae.csv", valve.chordae)
+    tips, families = valve.papillary_tips.round(3).tolist(), ", ".join(valve.chordae.family_names)
+    text = TEXT.format(tips=tips, families=families)
+    (folder / "case.yaml").write_text(text, encoding="utf-8")
     true = "".join(f"{name} {value:.2f} MPa\n" for name, value in zip(NAMES, TRUTH, strict=True))
     folder.with_name(f"{folder.name}_truth.txt").write_text(true, encoding="utf-8")
     return folder
