@@ -2,9 +2,9 @@
 A case from its folder to its report
 ====================================
 
-A case is a folder with ``case.yaml`` and surfaces. ``examples/case`` is minimal: an
-open and a closed surface, the papillary tips and the pressures. The rest is derived, and every
-derivation is listed.
+A case is a folder with ``case.yaml`` and surfaces. ``examples/case`` has an
+open and a closed surface, the papillary tips, the chordae and the pressures. The rest is derived,
+and every derivation is listed.
 """
 
 import tempfile

@@ -51,6 +51,8 @@ def test_a_chord_is_as_long_as_the_way_along_its_branches(case):
     # Its segments are shorter than any chord, its way is about as long as before.
     tips, chordae = case.frame(Role.REFERENCE).papillary_tips, case.chordae
     trees = nested(chordae, tips, 0.95)
+    # In the open valve the template's chordae are slack.
+    trees = replace(trees, rest_length=1.3 * trees.rest_length)
     assert np.linalg.norm(np.diff(trees.ends(tips), axis=1), axis=2).min() < 1.5
     assert implausible_values(replace(case, chordae=trees)) == ()
 
