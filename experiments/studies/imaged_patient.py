@@ -44,17 +44,17 @@ from mvest.cases.tissue import SEEN_CLOSURE
 from mvest.exchange.volumes import write_sequence_nrrd
 from mvest.imaging.simulator.acquisition import Probe, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import MovingValve, ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.observation.errors import SpatialCorrelation
 from mvest.problem.record import UNCALIBRATED, EstimateRecord, Unknown
+from mvest.problem.registration import REGISTRATION
 from mvest.problem.stored import entry_of
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reporting.skill import skill_table, verdict_table
 from mvest.reporting.tables import Column, Table, table
-from mvest.simulation.imaged_patient import ImagedPatient, simulate_imaged_patient
-from mvest.simulation.motion import DrawnValve, MotionSettings
+from mvest.simulation.motion import DrawnValve, MotionSettings, chord_ratios, close_in_motion
 from mvest.simulation.population import draw_tip_motion
 from mvest.simulation.virtual_patient import PatientSettings, draw_patient_values, first_that_closes
 from mvest.typing import FloatArray
@@ -63,8 +63,8 @@ from mvest.valve.anatomy.template import Template
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
-"""A patient, its imaging, and the number of anatomies drawn for it."""
+Made = tuple[DrawnValve, MovingValve, Probe, VolumeSequence, int]
+"""A patient, its true motion and imaging, and the number of anatomies drawn for it."""
 
 VOLUME, HIDDEN, TRUTH, REVEALED = "volume.seq.nrrd", "hidden", "hidden/truth", "hidden.json"
 """In a patient's folder: the estimator's input file; the folder with the better geometries, which
@@ -166,27 +166,31 @@ def _place(root: Path) -> Path:
 def _simulate(values: Values, patient: PatientSettings) -> Made:
     rng = np.random.default_rng(values["seed"])
     hidden, mechanics = draw_patient_values(patient, rng), mechanics_of(values)
+    # Nothing is displaced: leaflets, annulus and tips are in the same images.
+    hidden = {name: value for name, value in hidden.items() if name not in REGISTRATION}
 
-    def simulate(drawn: Template) -> ImagedPatient:
-        motion = draw_tip_motion(drawn, rng)
-        valve = DrawnValve(patient.name, drawn, hidden, mechanics, motion)
-        return simulate_imaged_patient(valve, MotionSettings())
+    def simulate(template: Template) -> tuple[DrawnValve, MovingValve]:
+        motion = draw_tip_motion(template, rng)
+        drawn = DrawnValve(patient.name, template, hidden, mechanics, motion)
+        return drawn, close_in_motion(drawn, MotionSettings())
 
-    made, draws = first_that_closes(
+    (drawn, valve), draws = first_that_closes(
         template_of(values), patient.variation, MAX_DRAWS, rng, simulate
     )
     acquisition = draw_acquisition(rng)
     probe = draw_probe(rng, acquisition)
-    return made, probe, simulate_volume(made.valve, acquisition, probe, values["seed"]), draws
+    volume = simulate_volume(valve, acquisition, probe, values["seed"])
+    return drawn, valve, probe, volume, draws
 
 
 def _write(place: Path, imaged: Made, patient: PatientSettings, described: Values) -> None:
-    made, probe, volume, draws = imaged
+    drawn, valve, probe, volume, draws = imaged
     (place / TRUTH).mkdir(parents=True)
     # A simulated volume's source names the patient; the file must not.
     write_sequence_nrrd(place / VOLUME, volume)
-    frames = CaseFrames(0, made.closed, made.pressure_mmHg)
-    true = true_sequence(made.valve, probe)
+    pressure = drawn.mechanics.protocol.pressure_mmHg
+    frames = CaseFrames(0, MotionSettings().frames - 1, pressure)
+    true, ratios = true_sequence(valve, probe), chord_ratios(drawn, valve, frames.closed)
     seen, samples = _segmented(true, frames, float(volume.spacing.max()), described["seed"])
     stated = replace(
         true,
@@ -205,11 +209,11 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
     write_json(
         place / TRUTH / REVEALED,
         {
-            "values": dict(made.values),
+            "values": dict(drawn.values),
             "stated": {"closed_frame": frames.closed, "pressure_mmHg": frames.pressure_mmHg},
             "made_from": dict(described),
             "anatomies_drawn": draws,
-            "chord_ratios": {name: each.tolist() for name, each in made.chord_ratios().items()},
+            "chord_ratios": {name: each.tolist() for name, each in ratios.items()},
         },
     )
 

@@ -314,3 +314,21 @@ def frames_along(points: FloatArray, count: int) -> IntArray:
         last = int(allowed[np.argmin(np.abs(path[allowed] - path[-1] * k / (count - 1)))])
         chosen.append(last)
     return np.array([*chosen, total - 1], dtype=np.int64)
+
+
+def chord_ratios(drawn: DrawnValve, valve: MovingValve, closed: int) -> dict[str, FloatArray]:
+    """Family -> true rest lengths of its chordae over the distance of their ends, closed.
+
+    `mvest.cases.tissue` lays chordae out by these ratios. The moving valve is the drawn one,
+    ``closed`` the number of its closed frame.
+    """
+    stated = drawn.template.valve(valve.layout.columns, valve.layout.rows)
+    surface, chordae = stated.surface, stated.chordae
+    place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
+    ends = place.interpolate(valve.vertices[closed], surface.triangles)
+    away = np.linalg.norm(ends - valve.tips[closed][chordae.end_tip], axis=1)
+    ratio = drawn.values["chord_rest_length"] * chordae.along(chordae.rest_length) / away
+    return {
+        name: ratio[chordae.family[: len(ratio)] == family]
+        for family, name in enumerate(chordae.family_names)
+    }

@@ -10,10 +10,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
-from mvest.problem.registration import REGISTRATION
-from mvest.simulation import imaged_patient as patients
 from mvest.simulation import motion, population
-from mvest.simulation.imaged_patient import simulate_imaged_patient
 from mvest.simulation.population import draw_population, load_population, save_population
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
@@ -229,24 +226,12 @@ def test_a_population_is_the_same_after_its_file_and_a_changed_one_is_refused(tm
 
 
 # --- patients -----------------------------------------------------------------------------------
-def test_an_imaged_patient_is_closed_as_those_of_a_population_and_nowhere_displaced(monkeypatch):
+def test_chords_are_as_long_as_they_are_stated_by_their_true_factor():
     hidden = {**VALUES, "chord_stiffness": 0.9, "chord_rest_length": 1.01}
-    seen = []
-
-    def close(drawn, settings):
-        seen.append((drawn, settings))
-        return still(frames=SMALL.frames + 2)
-
-    monkeypatch.setattr(patients, "close_in_motion", close)
-    displaced = {**hidden, **dict.fromkeys(REGISTRATION, 3.0)}
-    made = simulate_imaged_patient(drawn_valve("p", displaced), SMALL)
-    ((drawn, settings),) = seen
-    assert (drawn.values, settings) == (hidden, SMALL)
-    assert (made.closed, made.pressure_mmHg, made.values) == (4, 100.0, hidden)
-    np.testing.assert_array_equal(made.stated.chordae.rest_length, TEMPLATE.chordae().rest_length)
+    found = motion.chord_ratios(drawn_valve("p", hidden), still(frames=3), 2)
     # The valve does not move, so closed lengths are those to the closed tips.
-    ends = made.stated.chordae.insertion - TEMPLATE.papillary_tips[made.stated.chordae.end_tip]
-    found = np.concatenate(list(made.chord_ratios().values()))
-    laid_out = made.stated.chordae.along(made.stated.chordae.rest_length)
-    expected = 1.01 * laid_out / np.linalg.norm(ends, axis=1)
-    np.testing.assert_allclose(np.sort(found), np.sort(expected), rtol=0.02)
+    chordae = TEMPLATE.chordae()
+    ends = chordae.insertion - TEMPLATE.papillary_tips[chordae.end_tip]
+    expected = 1.01 * chordae.along(chordae.rest_length) / np.linalg.norm(ends, axis=1)
+    ratios = np.concatenate(list(found.values()))
+    np.testing.assert_allclose(np.sort(ratios), np.sort(expected), rtol=0.02)
