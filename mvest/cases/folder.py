@@ -100,7 +100,7 @@ def read_case(path: Path | str) -> ValveCase:
         frames=tuple(frame for frame, _ in placed),
         chordae=chordae,
         uncertainty=uncertainty,
-        derived=tuple(folder.derived),
+        derived=tuple(dict.fromkeys(folder.derived)),
         sha256=folder.sha256(),
         error_samples=samples,
         chordae_follow=entry is None or entry.follow,

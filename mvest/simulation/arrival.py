@@ -11,18 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.cases.folder import read_case, write_case
-from mvest.cases.schema import CASE_FILE
 from mvest.errors import ConfigurationError
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
-from mvest.exchange.surfaces import write_surface
+from mvest.exchange.importing.written import FoundFrame, case_of_frames
 from mvest.problem.registration import displace
 from mvest.quantities import Length
 from mvest.typing import FloatArray
@@ -152,36 +149,28 @@ def _through_labels(
     options = LeafletsOptions(anterior=1, posterior=2, tips=tips[0], observer_mm=0.0)
     _write_label_map(opened, frames[0], thickness, arrival.voxel_mm)
     if not arrival.closed:
-        imported = import_leaflets(opened, options)
-        return _with_closed(imported, frames[1], arrival.std_mm, folder / "by_hand")
+        return _with_closed(import_leaflets(opened, options), frames[1], arrival.std_mm)
     _write_label_map(closed, frames[1], thickness, arrival.voxel_mm)
     pressure = frames[1].pressure_mmHg
     both = replace(options, closed=str(closed), tips_closed=tips[1], pressure_mmHg=pressure)
     return import_leaflets(opened, both)
 
 
-def _with_closed(case: ValveCase, closed: Frame, std_mm: float, folder: Path) -> ValveCase:
+def _with_closed(case: ValveCase, closed: Frame, std_mm: float) -> ValveCase:
     """Add a closed midsurface to a case of an open frame; chordae are laid out by both frames."""
-    write_case(folder, case)
-    document = yaml.safe_load((folder / CASE_FILE).read_text(encoding="utf-8"))
-    region = {"region": np.asarray(closed.region)}
-    write_surface(folder / "closed.vtp", closed.vertices, closed.triangles, {}, region)
-    document["frames"].append(
-        {
-            "name": closed.name,
-            "time": closed.time,
-            "role": closed.role.value,
-            "surface": "closed.vtp",
-            "papillary_tips": closed.papillary_tips.tolist(),
-            "pressure": closed.pressure_mmHg,
-            "corresponds": False,
-        }
-    )
-    document["observation"] = {"std_mm": std_mm, "correlation_length_mm": 10.0}
-    del document["chordae"]
-    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
-    (folder / CASE_FILE).write_text(text, encoding="utf-8")
-    return read_case(folder)
+    of_reference = {name: getattr(case.surface, name) for name in ("fibre", "thickness")}
+    frames = [
+        FoundFrame(f.name, f.role, f.time, f.pressure_mmHg, f, f.papillary_tips, data)
+        for f, data in zip((*case.frames, closed), (of_reference, {}), strict=True)
+    ]
+    document = {
+        "name": case.name,
+        "thickness": {"point_data": "thickness"},
+        "fibre": "fibre",
+        "observation": {"std_mm": std_mm, "correlation_length_mm": 10.0},
+        "derived": list(case.derived),
+    }
+    return case_of_frames(frames, document, mirrored=True)
 
 
 def _in_lps(frame: Frame) -> Frame:

@@ -168,7 +168,8 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
             derived += [f"{name} frame: {done}"] * bool(done)
             anterior = surface.vertices[surface.annulus[len(surface.annulus) // 4]]
             load = (CLOSED_AT, options.pressure_mmHg or 0.0) if frames else (0.0, 0.0)
-            frames.append(FoundFrame(name, one.role, *load, surface, tips, surface.thickness))
+            data = {"thickness": surface.thickness}
+            frames.append(FoundFrame(name, one.role, *load, surface, tips, data))
     if len(frames) > 1:
         derived.append(f"time of the closed frame: {CLOSED_AT:g} s of a generic cardiac cycle")
         if options.tips_closed is None:

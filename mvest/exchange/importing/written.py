@@ -5,20 +5,20 @@ A case is written to a folder and read back with the usual checks.
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from mvest.cases.case import Role, ValveCase
+from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import implausible_values
 from mvest.cases.schema import CASE_FILE
 from mvest.cases.tissue import write_chordae
 from mvest.errors import InputError, MvestError
-from mvest.exchange.surfaces import Surface, write_surface
+from mvest.exchange.surfaces import Data, Surface, write_surface
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.midsurface import Midsurface
@@ -67,9 +67,9 @@ class FoundFrame:
     role: Role
     time: float
     pressure: float
-    surface: Midsurface | Surface
+    surface: Midsurface | Surface | Frame
     tips: FloatArray
-    thickness: FloatArray | None = None
+    point_data: Data = field(default_factory=dict)
 
 
 def case_of_frames(
@@ -97,11 +97,9 @@ def case_of_frames(
     with tempfile.TemporaryDirectory() as temporary:
         folder, entries = Path(temporary), []
         for number, one in enumerate(frames):
-            data = {} if one.thickness is None else {"thickness": one.thickness}
-            surface, labels = one.surface, {"region": np.asarray(one.surface.region)}
-            write_surface(
-                folder / f"{number}.vtp", surface.vertices, surface.triangles, data, labels
-            )
+            shape = one.surface.vertices, one.surface.triangles
+            labels = {"region": np.asarray(one.surface.region)}
+            write_surface(folder / f"{number}.vtp", *shape, one.point_data, labels)
             entry = {"name": one.name, "role": one.role.value, "time": float(one.time)}
             entry |= {"surface": f"{number}.vtp", "papillary_tips": one.tips.tolist()}
             apart = {} if one.role is Role.REFERENCE else {"corresponds": False}
