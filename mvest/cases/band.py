@@ -17,15 +17,13 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.surface_coordinates import boundary_loops
-from mvest.valve.geometry.triangles import directed_edges, surface_edges
+from mvest.valve.geometry.triangles import connected_pieces, directed_edges, surface_edges
 
 ANNULUS_DIAMETER = (15.0, 80.0)
 """mm, largest extent of an annulus, from a small child's to the most dilated adult's."""
@@ -290,10 +288,8 @@ def check_band(vertices: FloatArray, triangles: IntArray, *, self_intersections:
             f"vertices {unused[:5].tolist()} ({len(unused)} in all) belong to no triangle; remove "
             "them"
         )
-    edges = surface_edges(triangles)
-    n = len(vertices)
-    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
-    pieces, label = connected_components(graph, directed=False)
+    edges, n = surface_edges(triangles), len(vertices)
+    pieces, label = connected_pieces(edges, n)
     if pieces > 1:
         sizes = np.bincount(label).tolist()
         raise GeometryError(

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
@@ -24,6 +22,7 @@ from mvest.exchange.mesh_files import READERS, polydata, read_cells, vtk_module
 from mvest.files import write_atomically
 from mvest.reading.text import MAX_NUMBER, one_line, refusing
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.triangles import connected_pieces
 
 Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
@@ -169,8 +168,7 @@ def merged(surface: Surface) -> Surface:
             "diagonal; are some far away?"
         )
     pairs = tree.query_pairs(near, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), pairs.T), shape=(n, n))
-    _, group = connected_components(graph, directed=False)
+    _, group = connected_pieces(pairs, n)
     corners = group[surface.triangles.ravel()]
     _, first, inverse = np.unique(corners, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))

@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mvest.cases.band import loop_vector_area, two_loops, without_ears
@@ -26,7 +24,7 @@ from mvest.valve.anatomy.valve import BandGrid, band_grid
 from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.thickening import smooth_vertex_normals
-from mvest.valve.geometry.triangles import areas, surface_edges
+from mvest.valve.geometry.triangles import areas, connected_pieces, surface_edges
 
 COINCIDENT = 1e-6
 """Merge distance (mm) of the vertices of both leaflets."""
@@ -77,9 +75,7 @@ class Leaflet:
         points, faces = whole.vertices, whole.triangles
         apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
         faces = faces[apart & (areas(points, faces) > 0)]
-        edges, n = surface_edges(faces), len(points)
-        graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
-        piece = connected_components(graph, directed=False)[1][faces[:, 0]]
+        piece = connected_pieces(surface_edges(faces), len(points))[1][faces[:, 0]]
         faces = faces[piece == np.argmax(np.bincount(piece, weights=areas(points, faces)))]
         loops = sorted(boundary_loops(faces), key=lambda loop: -loop_length(points[loop]))
         if not loops:

@@ -8,15 +8,13 @@ can therefore be laid out on any valve as on the template.
 """
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve, sampled_valve
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 from mvest.valve.geometry.thickening import smooth_normals_change, smooth_vertex_normals
-from mvest.valve.geometry.triangles import edges_between, mean_fibre
+from mvest.valve.geometry.triangles import connected_pieces, edges_between, mean_fibre
 
 INSIDE = 2.0
 """Degrees from the line between two leaflets at which the fibre of each is read."""
@@ -79,9 +77,7 @@ class Band:
         names = self.region_names
         if len(names) == 1:
             return [np.array([[0.0, 0.0], [1.0, 0.0]])]
-        count = len(self._between)
-        edges = coo_array((np.ones(len(between)), between.T), shape=(count, count))
-        piece = connected_components(edges, directed=False)[1]
+        _, piece = connected_pieces(between, len(self._between))
         theta, s = np.mod(self._sign * self._coordinates.theta, 2 * np.pi), self._coordinates.s
         lines = []
         for number in np.unique(piece[between]):

@@ -12,8 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.special import erf
 from skimage import measure
@@ -22,7 +20,7 @@ from mvest.errors import GeometryError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.triangles import euler_number, surface_edges
+from mvest.valve.geometry.triangles import connected_pieces, euler_number, surface_edges
 
 # skimage has no type hints.
 marching_cubes: Any = measure.marching_cubes
@@ -316,10 +314,7 @@ def _behind_outermost(depth: FloatArray, outward: FloatArray) -> FloatArray:
 
 def _largest(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray, int]:
     """The largest connected piece, and the number of other pieces."""
-    edges = surface_edges(triangles)
-    n = len(vertices)
-    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
-    pieces, piece = connected_components(graph, directed=False)
+    pieces, piece = connected_pieces(surface_edges(triangles), len(vertices))
     kept = np.bincount(piece).argmax()
     used, inverse = np.unique(triangles[piece[triangles[:, 0]] == kept], return_inverse=True)
-    return vertices[used], inverse.reshape(-1, 3), int(pieces) - 1
+    return vertices[used], inverse.reshape(-1, 3), pieces - 1

@@ -4,8 +4,6 @@ Each fault raises a `GeometryError` that names the fault and the triangles, edge
 """
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
@@ -14,7 +12,7 @@ from mvest.valve.geometry.proximity import (
     intersecting_triangles,
     overlapping_boxes,
 )
-from mvest.valve.geometry.triangles import edge_table
+from mvest.valve.geometry.triangles import connected_pieces, edge_table
 
 MAX_LOOKED_AT = 100_000
 """Number of candidate pairs searched for the intersections named in a message."""
@@ -160,9 +158,7 @@ def _check_vertex_fans(faces: IntArray, name: str) -> None:
     after_first, after_second = (k - k % 3 + (k + 1) % 3 for k in (first, second))
     rows = np.concatenate([first, after_first])
     columns = np.concatenate([after_second, second])
-    n = 3 * len(faces)
-    graph = sp.coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
+    _, label = connected_pieces(np.column_stack([rows, columns]), 3 * len(faces))
     fans = np.unique(np.column_stack([faces.ravel(), label]), axis=0)
     vertex, number = np.unique(fans[:, 0], return_counts=True)
     if (number > 1).any():

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from mvest.typing import FloatArray, IntArray
 
@@ -59,6 +60,13 @@ def edge_table(triangles: IntArray) -> tuple[IntArray, IntArray, IntArray, IntAr
         np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
     )
     return half, edges, inverse.ravel(), count
+
+
+def connected_pieces(pairs: IntArray, n: int) -> tuple[int, IntArray]:
+    """The number of pieces of n points that ``pairs (k, 2)`` connect, and that ``(n,)`` of each."""
+    graph = sparse.coo_matrix((np.ones(len(pairs), dtype=np.int8), pairs.T), shape=(n, n))
+    count, piece = connected_components(graph, directed=False)
+    return int(count), piece.astype(np.int64)
 
 
 def euler_number(triangles: IntArray) -> int:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError
@@ -21,7 +20,7 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import lumped_areas, vertex_normals
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 from mvest.valve.geometry.surface_coordinates import boundary_loops
-from mvest.valve.geometry.triangles import euler_number, surface_edges
+from mvest.valve.geometry.triangles import connected_pieces, euler_number, surface_edges
 
 MAX_THICKNESS = 8.0
 """Diameter of the first ball, mm; diseased leaflets are up to 5 mm thick."""
@@ -67,7 +66,7 @@ def closed_band(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, 
     if enclosed_volume(vertices, triangles) < 0:
         triangles = triangles[:, ::-1]
     edges = surface_edges(triangles)
-    pieces, label = connected_components(_graph(edges, np.ones(len(edges)), len(vertices)))
+    pieces, label = connected_pieces(edges, len(vertices))
     if pieces > 1:
         sizes = np.sort(np.bincount(label))[::-1]
         raise GeometryError(
@@ -184,7 +183,7 @@ def _in_two_pieces(side: FloatArray, edges: IntArray) -> FloatArray:
     for sign in (1, -1):
         within = side * sign > 0
         inner = edges[within[edges].all(axis=1)]
-        _, label = connected_components(_graph(inner, np.ones(len(inner)), len(side)))
+        _, label = connected_pieces(inner, len(side))
         largest = np.bincount(label[within]).argmax()
         island = within & (label != largest)
         side[island] *= -1
