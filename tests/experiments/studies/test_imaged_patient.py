@@ -19,8 +19,10 @@ from experiments.studies.imaged_patient import HIDDEN, KNOWN, SEGMENTED, VOLUME
 from experiments.studies.imaged_patient import TRUTH as TRUTH_FOLDER
 from mvest.errors import InputError
 from mvest.personalisation.calibration import MeasuredFor, calibrate, read_calibration
-from mvest.simulation.virtual_patient import PatientSettings
+from mvest.problem.registration import REGISTRATION
+from mvest.simulation.virtual_patient import PatientSettings, draw_patient_values
 from tests.calibrated_patients import patients
+from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up import made_up
 from tests.experiments.studies.made_up_patients import a_result
 
@@ -101,6 +103,25 @@ def test_a_calibration_needs_the_volume_alone(estimated):
     (estimate,) = estimated(a_result(5.0, 2.5), "not asked", "not asked", ()).estimates
     assert [(own.truth, own.estimate) for own in estimate.moduli] == [(6.0, 5.0), (2.0, 2.5)]
     assert estimate.alternatives == {}
+
+
+def test_an_imaged_valve_has_the_drawn_truth_and_is_nowhere_displaced(monkeypatch):
+    values, closed = plain(composed("experiment=volumes", "seed=3")), []
+
+    class EndedError(Exception):
+        pass
+
+    def close(drawn, settings):
+        closed.append(drawn)
+        raise EndedError
+
+    monkeypatch.setattr(imaged_patient, "close_in_motion", close)
+    settings = build(imaged_patient.Settings, values)
+    with pytest.raises(EndedError):
+        imaged_patient._simulate(values, settings.patient)
+    drawn = draw_patient_values(settings.patient, np.random.default_rng(3))
+    assert any(drawn[name] for name in REGISTRATION)
+    assert closed[0].values == {k: v for k, v in drawn.items() if k not in REGISTRATION}
 
 
 MEASURED_FOR = MeasuredFor(way="volume", made_by="ab" * 32, settings="cd" * 32)
