@@ -73,8 +73,9 @@ def setting_groups() -> str:
 def setting_ranges() -> str:
     """Ranges of settings, by kind of quantity."""
     found: dict[tuple[str, ...], set[str]] = {}
-    for kind in [Config, *(load_study(name).settings for name in study_names())]:
-        for key, mark in marks_in(kind):
+    studies = map(load_study, study_names())
+    for kind, part in [(Config, ""), *((study.settings, study.part) for study in studies)]:
+        for key, mark in marks_in(kind, part):
             if not isinstance(mark, Within):
                 continue
             row = (f"{mark.low:.10g}", f"{mark.high:.10g}", mark.unit, mark.why)

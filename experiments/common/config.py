@@ -262,8 +262,7 @@ def _kinds(study: str | None) -> dict[str, Any]:
     """Top-level setting of a study -> its type."""
     if study not in study_names():
         return hints_of(Config)
-    settings: type = load_study(study).settings
-    return {**hints_of(Config), **hints_of(settings)}
+    return {**hints_of(Config), **load_study(study).kinds}
 
 
 class Studies(dict[str, Any]):
@@ -274,8 +273,9 @@ class Studies(dict[str, Any]):
 
     def __getitem__(self, file: str) -> ConfigNode:
         name = file.removesuffix(".yaml")
-        settings: type = load_study(name).settings
-        config = OmegaConf.structured(schema(Config, settings))
+        study = load_study(name)
+        settings: type = study.settings
+        config = OmegaConf.structured(schema(Config, settings, part=study.part))
         config.study = name
         return ConfigNode(file, config, "study", "_global_", "mvest")
 

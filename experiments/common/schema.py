@@ -211,13 +211,17 @@ def _require_plain(value: Any, key: str) -> None:
 
 
 @cache
-def schema(*classes: type) -> type:
+def schema(*classes: type, part: str = "") -> type:
     """A mutable dataclass that OmegaConf accepts, with the fields of frozen dataclasses.
 
-    Tuples become lists, and nested dataclasses schemas of their own. Defaults are the same.
+    Tuples become lists, and nested dataclasses schemas of their own. Defaults are the same. With
+    ``part`` the last class is not joined to the others, but a field of this name.
     """
     fields: dict[str, Any] = {}
-    for cls in classes:
+    if part:
+        own = schema(classes[-1])
+        fields[part] = (part, own, dataclasses.field(default_factory=own))
+    for cls in classes[:-1] if part else classes:
         hints = typing.get_type_hints(cls)
         for field in dataclasses.fields(cls):
             kind = _config_type(hints[field.name])

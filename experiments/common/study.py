@@ -11,11 +11,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import experiments.studies
 from experiments.common.records.record import Record
 from experiments.common.records.record import Result as Result
+from experiments.common.schema import Values, hints_of, validated
 from mvest.errors import ConfigurationError
 from mvest.provenance import NUMBERS
 from mvest.reporting.tables import Table, joined
@@ -80,6 +81,7 @@ class Study(Generic[S]):
     """How a kind of study is run and shown."""
 
     settings: type[S]  # frozen dataclass: what the study adds to the configuration
+    part: str = ""  # name of this part of the configuration; empty: its fields are top-level
     run: Callable[[Job[S]], Result]
     # Tables for readers, by name. The results' own tables are then written as CSV only.
     summary: Callable[[Results], Mapping[str, Table]] | None = None
@@ -100,6 +102,16 @@ class Study(Generic[S]):
     require: Callable[[Mapping[str, Any]], None] = lambda values: None
     # Kinds of golden runs whose numbers change if those of this study do (see `NUMBERS`).
     golden: tuple[str, ...] = tuple(NUMBERS)
+
+    @property
+    def kinds(self) -> dict[str, Any]:
+        """Top-level settings that the study adds -> their types."""
+        return {self.part: self.settings} if self.part else hints_of(cast(type, self.settings))
+
+    def settings_of(self, values: Values) -> S:
+        """Its settings in a configuration; raises an `MvestError` if one is inadmissible."""
+        own = values[self.part] if self.part else values
+        return cast(S, validated(self.settings, own, self.part))
 
 
 def study_names() -> tuple[str, ...]:

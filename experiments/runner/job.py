@@ -97,7 +97,7 @@ def compute(request: Request, memory_gb: float) -> None:
         record = jobs.last_record(folder, request.config_hash, cut_off=True)
         if record is None:
             started = time.time()
-            settings = build(study.settings, values)
+            settings = study.settings_of(values)
             result = study.run(Job(values, settings, folder, request.config_hash))
             if hash_of(values) != request.config_hash:
                 # It is unknown which content was read.

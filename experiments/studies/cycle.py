@@ -19,7 +19,7 @@ from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import noise_words
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import Mesh, Number
-from experiments.common.schema import Values, build
+from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.cycle import CycleModel, CycleProtocol, compare_time_steps, with_mesh_error
 from mvest.errors import ConfigurationError, InputError
@@ -62,24 +62,17 @@ class CycleSettings:
     path_steps: Count = 16  # steps of the path that tests for jumps
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Settings that the study adds to the configuration."""
-
-    cycle: CycleSettings = field(default_factory=CycleSettings)
-
-
 FINER_STEP, PATH_CHANGE = 0.5, -0.3
 """Time step on other meshes relative to the estimator's, and relative change of the first parameter
 along the path that tests frames for jumps."""
 
 
-def run_cycle(job: Job[Settings]) -> Result:
+def run_cycle(job: Job[CycleSettings]) -> Result:
     """Simulate a cycle, compute the bounds of its frames, and make the configured estimates.
 
     InputError if the true cycle fails on one of the meshes, or a setting is inadmissible.
     """
-    values, settings = job.values, job.settings.cycle
+    values, settings = job.values, job.settings
     truth = np.array(values["truth"]["values"], dtype=float)
     model = CycleModel(closure_model(values), settings.protocol)
     with _bar("true cycle", model, 1):
@@ -211,7 +204,7 @@ def _observation(
 
 def expect_cycle(values: Values, _folder: Path | None = None) -> str:
     """Text for ``check=true``: expected intervals from all frames of a cycle."""
-    settings = build(CycleSettings, values["cycle"])
+    settings = STUDY.settings_of(values)
     model, problem = _problem(values, settings)
     at = settings.protocol.frame_sets()[WHOLE]
     rest = model.closure.valve.surface.vertices
@@ -263,7 +256,8 @@ def _draw_errors(axes: Any, estimates: Sequence[EstimateRecord]) -> None:
 
 
 STUDY = Study(
-    settings=Settings,
+    settings=CycleSettings,
+    part="cycle",
     run=run_cycle,
     figure=figure,
     captions={

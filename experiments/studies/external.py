@@ -18,7 +18,7 @@ import numpy as np
 from experiments.common.building.filters import build_filter
 from experiments.common.places import CHECKOUT
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.schema import NOT_HASHED, InputFile, Reads, Values, build, contents
+from experiments.common.schema import NOT_HASHED, InputFile, Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
@@ -82,13 +82,6 @@ class ExternalSettings(ModelSettings):
     noise_mm: Length | None = None  # SD of the error of each observed coordinate
     models: dict[str, ModelSettings] = field(default_factory=dict)  # several, with their settings
     data: tuple[str, ...] = ()  # models that predict observations from truth.values
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Settings that the study adds to the configuration."""
-
-    external: ExternalSettings = field(default_factory=ExternalSettings)
 
 
 def problem_of(about: ExternalSettings, values: Values) -> Problem:
@@ -169,9 +162,9 @@ def _points(file: str | None, what: str) -> FloatArray:
         raise ConfigurationError(f"external.{what} = {file}: {error}") from error
 
 
-def run(job: Job[Settings]) -> Result:
+def run(job: Job[ExternalSettings]) -> Result:
     """Fit each model to each observation."""
-    about = job.settings.external
+    about = job.settings
     problem = problem_of(about, job.values)
     names, noise_mm = problem.parameters, float(about.noise_mm or 0.0)
     true = list(map(float, job.values["truth"]["values"]))
@@ -230,7 +223,7 @@ def check_external(values: Values, folder: Path) -> str:
 
     MvestError if a setting or a file is inadmissible, or the program gives no prediction.
     """
-    about = build(ExternalSettings, values["external"])
+    about = STUDY.settings_of(values)
     problem = problem_of(about, values)
     y, m = _points(about.observation, "observation"), problem.prior.mean
     model = model_of(about, problem.parameters, "model", len(y), folder)
@@ -264,7 +257,8 @@ def figure(results: Results) -> Figure | None:
 
 
 STUDY = Study(
-    settings=Settings,
+    settings=ExternalSettings,
+    part="external",
     run=run,
     figure=figure,
     captions={"": "Parameters after each iteration, with each model."},

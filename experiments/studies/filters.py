@@ -60,19 +60,12 @@ class FilterStudySettings:
     reference: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Settings that the study adds to the configuration."""
-
-    filters: FilterStudySettings
-
-
-def run(job: Job[Settings]) -> Result:
+def run(job: Job[FilterStudySettings]) -> Result:
     """Run every filter on every problem.
 
     MvestError if a setting is inadmissible, or the reference gives no draws.
     """
-    settings, seed = job.settings.filters, job.values["seed"]
+    settings, seed = job.settings, job.values["seed"]
     rows: list[dict[str, Any]] = []
     references: list[dict[str, Any]] = []
     mesh, solves = None, 0
@@ -252,7 +245,8 @@ def figure(results: Results) -> Figure:
 
 
 STUDY = Study(
-    settings=Settings,
+    settings=FilterStudySettings,
+    part="filters",
     run=run,
     figure=figure,
     captions={

@@ -7,7 +7,7 @@ The gate closes an anatomy under variations that must not matter, and follows it
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,19 +40,12 @@ class GateSettings:
     every_step: bool = False  # measure one closure step by step, without the gate
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Settings that the study adds to the configuration."""
-
-    gate: GateSettings = field(default_factory=GateSettings)
-
-
-def run(job: Job[Settings]) -> Result:
+def run(job: Job[GateSettings]) -> Result:
     """Measure one closure, or run the gate."""
-    return _closing(job) if job.settings.gate.every_step else _gate(job)
+    return _closing(job) if job.settings.every_step else _gate(job)
 
 
-def _gate(job: Job[Settings]) -> Result:
+def _gate(job: Job[GateSettings]) -> Result:
     values = job.values
     report = gate_report(values)
     model, truth = closure_model(values), truth_of(values)
@@ -70,7 +63,7 @@ def _gate(job: Job[Settings]) -> Result:
     )
 
 
-def _closing(job: Job[Settings]) -> Result:
+def _closing(job: Job[GateSettings]) -> Result:
     closing = close_valve(job.values)
     simulation = closing.result.simulation
     return Result(
@@ -184,7 +177,8 @@ def _draw_curves(part: Any, values: Mapping[str, Any], moments: list[int], at_re
 
 
 STUDY = Study(
-    settings=Settings,
+    settings=GateSettings,
+    part="gate",
     run=run,
     summary=summary,
     figure=figure,

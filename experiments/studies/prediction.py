@@ -93,19 +93,12 @@ class PredictionSettings:
     check_mesh: tuple[AxisCount, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Settings that the study adds to the configuration."""
-
-    prediction: PredictionSettings = field(default_factory=PredictionSettings)
-
-
-def run_prediction(job: Job[Settings]) -> Result:
+def run_prediction(job: Job[PredictionSettings]) -> Result:
     """Estimate and predict every patient, then compare with the truth.
 
     ConfigurationError if scenarios, samples or the spread of true parameters are inadmissible.
     """
-    config, settings = job.values, job.settings.prediction
+    config, settings = job.values, job.settings
     if not settings.scenarios:
         raise ConfigurationError("prediction.scenarios is empty, expected at least one")
     for name in ("samples", "further_samples"):
@@ -361,7 +354,8 @@ def _draw_measure(axes: Any, rows: DataFrame, titles: Sequence[str]) -> None:
 
 
 STUDY = Study(
-    settings=Settings,
+    settings=PredictionSettings,
+    part="prediction",
     run=run_prediction,
     figure=figure,
     captions={

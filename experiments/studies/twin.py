@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,20 +42,13 @@ class TwinSettings:
     measure_truth: bool = False  # strain, stress and tenting of the closed valve that is observed
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Settings that the study adds to the configuration."""
-
-    twin: TwinSettings = field(default_factory=TwinSettings)
-
-
-def run_twin(job: Job[Settings]) -> Result:
+def run_twin(job: Job[TwinSettings]) -> Result:
     """Simulate an observation per seed and estimate from it; arrays come from the first."""
     values = job.values
     twin = build_twin(values)
     if twin.model.mesh.element_type == "tet4":
         print(LOCKING, file=sys.stderr)
-    measured = _measured(twin) if job.settings.twin.measure_truth else {}
+    measured = _measured(twin) if job.settings.measure_truth else {}
     seeds = range(values["seed"], values["seed"] + values["repeats"])
     results = estimate_twin(twin, seeds)
     result = results[0]
@@ -221,7 +214,8 @@ def figure(results: Results) -> dict[str, Figure]:
 
 
 STUDY = Study(
-    settings=Settings,
+    settings=TwinSettings,
+    part="twin",
     run=run_twin,
     summary=summary,
     figure=figure,

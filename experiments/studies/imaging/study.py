@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.common.records.record import Number
-from experiments.common.schema import Values, build
+from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore, Seen
 from mvest.cases.from_images.detector_errors import coverage
@@ -79,18 +79,11 @@ COLUMNS: Mapping[str, Column] = {
 """Columns with a unit, in all tables."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Settings that the study adds to the configuration."""
-
-    imaging: ImagingSettings
-
-
 # -- run ------------------------------------------------------------------------------------------
-def run_imaging(job: Job[Settings]) -> Result:
+def run_imaging(job: Job[ImagingSettings]) -> Result:
     """Train detectors, test them on other valves, and save them in the folder of the run."""
     require_imaging(job.values)
-    settings = job.settings.imaging
+    settings = job.settings
     store = ImagingStore(job.values, settings)
     if settings.model is not None:
         file = MODEL_FILE if settings.model == PACKAGED else Path(settings.model)
@@ -344,7 +337,7 @@ def figure(results: Results) -> Figure | None:
 # -- settings -------------------------------------------------------------------------------------
 def require_imaging(config: Values) -> None:
     """Raise a MvestError that names an inadmissible setting."""
-    settings = build(Settings, config).imaging
+    settings = STUDY.settings_of(config)
     seeds = [getattr(settings, which).seed for which in POPULATIONS]
     if len(set(seeds)) < len(seeds):
         names = ", ".join(f"imaging.{which}.seed" for which in POPULATIONS)
@@ -361,7 +354,8 @@ def require_imaging(config: Values) -> None:
 
 
 STUDY = Study(
-    settings=Settings,
+    settings=ImagingSettings,
+    part="imaging",
     run=run_imaging,
     figure=figure,
     captions={

@@ -39,7 +39,11 @@ def marked(cls: type, above: str = "") -> Iterator[str]:
                 yield from marked(kind, f"{above}{field.name}.")
 
 
-SETTINGS = [(study, name) for study in study_names() for name in marked(load_study(study).settings)]
+SETTINGS = [
+    (name, setting)
+    for name, study in ((name, load_study(name)) for name in study_names())
+    for setting in marked(study.settings, f"{study.part}." if study.part else "")
+]
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.common.records.record import read_record
 from experiments.common.study import Job
-from experiments.studies.external import STUDY, ExternalSettings, ModelSettings, Settings
+from experiments.studies.external import STUDY, ExternalSettings, ModelSettings
 from mvest.exchange.external.contract import write_points
 from tests.exchange.external.programs import SPRINGS, springs
 from tests.experiments.configured import composed, plain
@@ -141,7 +141,7 @@ def test_several_models_estimate_from_what_one_of_them_predicts(tmp_path):
         prior_std=(3.0,),
         noise_mm=0.01,
     )
-    result = STUDY.run(Job(values, Settings(external=about), tmp_path))
+    result = STUDY.run(Job(values, about, tmp_path))
     (one,), (other,) = (record.unknowns for record in result.estimates)
     # Errors of 0.01 mm, seen.
     assert one.estimate != 3.0

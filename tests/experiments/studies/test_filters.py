@@ -7,9 +7,8 @@ import pytest
 
 from experiments.common.config import plain
 from experiments.common.records.record import read_record
-from experiments.common.schema import build
 from experiments.run import main
-from experiments.studies.filters import Settings, run
+from experiments.studies.filters import STUDY, run
 from mvest.errors import ConfigurationError
 from tests.experiments.configured import composed
 from tests.experiments.studies.test_gate import SMALL
@@ -23,7 +22,7 @@ def test_a_reference_without_draws_is_refused() -> None:
     values["filters"]["reference"] = {
         "_target_": "mvest.estimation.filters.iterated.ExtendedFilter"
     }
-    settings = build(Settings, {"filters": values["filters"]})
+    settings = STUDY.settings_of(values)
     with pytest.raises(ConfigurationError, match=r"filters\.reference: no draws"):
         run(SimpleNamespace(settings=settings, values=values))
 

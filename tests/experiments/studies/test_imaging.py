@@ -8,11 +8,11 @@ import pandas as pd
 import pytest
 
 from experiments.common.records.record import Record, read_record
-from experiments.common.schema import build
 from experiments.results.published import records_of
 from experiments.run import main
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore
-from experiments.studies.imaging.study import Settings, calibrated, error_rows, judge, kind_rows
+from experiments.studies.imaging.study import STUDY as IMAGING
+from experiments.studies.imaging.study import calibrated, error_rows, judge, kind_rows
 from mvest.errors import InputError
 from mvest.imaging.detection.trained_model import DetectionModel, load_model, save_model
 from mvest.reporting.tables import table
@@ -52,7 +52,7 @@ def done(tmp_path_factory) -> Path:
 
 
 def settings_of(*overrides: str) -> ImagingSettings:
-    return build(Settings, values_of(*overrides)).imaging
+    return IMAGING.settings_of(values_of(*overrides))
 
 
 def store_of(*overrides: str) -> ImagingStore:
