@@ -1,4 +1,4 @@
-"""Progress of a single run: forward solves, steps of a filter, time left.
+"""Progress of a single run: steps of a filter, forward solves, time left.
 
 A terminal shows a bar. Elsewhere, and for events that matter, lines go to standard error, which in
 a sweep is the job's log. There is a line at least every ten seconds.
@@ -24,8 +24,6 @@ WIDTH = 100  # characters of a line of a terminal
 TYPICAL_SOLVES = 6
 """Forward solves that a filter usually needs; only the first guess of what is left."""
 
-QUICK_S = 1.0  # a forward solve that ends sooner than this after the last line gets no line
-
 
 def duration(seconds: float) -> str:
     """Seconds, minutes and hours as a clock shows them."""
@@ -49,10 +47,11 @@ def say(text: str) -> None:
 
 
 class Heartbeat:
-    """Writes the status whenever nothing was written for `SILENCE_S`; redraws a visible bar."""
+    """A bar, and a line with the status whenever nothing was written for `SILENCE_S`."""
 
-    def __init__(self, bar: Any, status: Callable[[], str]) -> None:
-        self._bar, self._status, self._ended = bar, status, threading.Event()
+    def __init__(self, status: Callable[[], str], **bar: Any) -> None:
+        self.bar = tqdm(leave=False, **bar)
+        self._status, self._ended = status, threading.Event()
         self.last = self.began = time.monotonic()
         threading.Thread(target=self._beat, daemon=True).start()
 
@@ -69,18 +68,18 @@ class Heartbeat:
     def end(self) -> None:
         """Stop, and remove the bar."""
         self._ended.set()
-        self._bar.close()
+        self.bar.close()
 
     def _beat(self) -> None:
         while not self._ended.wait(1.0):
-            if not self._bar.disable:
-                self._bar.refresh()
+            if not self.bar.disable:
+                self.bar.refresh()
             elif time.monotonic() - self.last >= SILENCE_S - 1.0:
                 self.say(self._status())
 
 
 class SolveBar:
-    """Reports forward solves and steps of a filter; a bar moves with the time steps of a solve.
+    """Reports steps of a filter; a bar moves with the time steps of a forward solve.
 
     ``steps`` is the number of time steps of one solve; 0 for a model that reports none, which gets
     no bar. ``solves`` are expected, and after these one more at a time. ``names`` are those of the
@@ -91,62 +90,56 @@ class SolveBar:
     def __init__(
         self, title: str, steps: int, solves: int, names: Sequence[str] = (), whole: float = 0.0
     ) -> None:
-        self._title, self._names, self._expected, self._steps = title, names, solves, steps
-        self._solve, self._last, self._made, self._whole = 0, math.inf, 0, whole
-        self._spent: list[float] = []
-        self._bar = tqdm(
-            total=steps, desc=title, unit="step", disable=None if steps else True, leave=False
-        )
-        self._lines = Heartbeat(self._bar, self._status)
-        self._solve_began = self._now = self._lines.began
+        self._title, self._steps, self._expected = title, steps, solves
+        self._names, self._whole = list(names), whole
+        self._made, self._reached = 0, math.inf  # steps of the present solve, and its time
+        self._spent: list[float] = []  # on each solve that has ended
+        bar = {"total": steps, "desc": title, "unit": "step", "disable": None if steps else True}
+        self._lines = Heartbeat(self._status, **bar)
+        self._began = self._now = self._lines.began
 
     def __enter__(self) -> SolveBar:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self._end_solve()
+    def __exit__(self, *_: object) -> None:
         self._lines.end()
 
     def step(self, time_s: float, newton_iterations: int) -> None:
         """One more time step, reached at ``time_s``; the time falls when a new solve begins."""
-        if time_s <= self._last:
+        if time_s <= self._reached:
             self._end_solve()
-            self._solve += 1
-            self._bar.reset()
-            self._bar.set_description(f"{self._title}, forward solve {self._solve}", refresh=False)
-        self._last, self._now = time_s, time.monotonic()
+            self._lines.bar.reset()
+            self._lines.bar.set_description(f"{self._title}, {self._solve}", refresh=False)
+        self._reached, self._now = time_s, time.monotonic()
         self._made += 1
-        self._bar.update(1)
+        self._lines.bar.update(1)
 
     def iterate(self, number: int, m: FloatArray, objective: float) -> None:
         """One more iterate of a filter: its number, the parameters (p,) and the objective."""
         self._end_solve()
-        self._solve_began = time.monotonic()
-        names = list(self._names)
+        self._began = time.monotonic()
+        names = self._names
         if len(names) != len(m):  # a first stage estimates the moduli alone
             names = [name for name in names if name.startswith("E_f.")]
         values = [f"{name} {value:.4g}" for name, value in zip(names, m, strict=False)]
-        self._say(f"step {number}: objective {objective:.4g}", *values)
+        step = f"step {number}: objective {objective:.4g}"
+        self._lines.say(", ".join([self._title, step, *values, *self._left()]))
 
     def _end_solve(self) -> None:
-        """Report the forward solve that has ended, if it was not reported yet."""
-        if not self._made:
-            return
-        spent = self._now - self._solve_began
-        self._spent.append(spent)
-        if self._now - self._lines.last >= QUICK_S:
-            self._say(f"forward solve {self._solve}: {self._made} time steps in {spent:.1f} s")
-        self._solve_began, self._made, self._last = self._now, 0, math.inf
+        if self._made:
+            self._spent.append(self._now - self._began)
+            self._began, self._made, self._reached = self._now, 0, math.inf
+
+    @property
+    def _solve(self) -> str:
+        return f"forward solve {len(self._spent) + 1}"
 
     def _status(self) -> str:
         """Progress within a solve."""
         of = f" of {self._steps}" if self._steps >= self._made else ""
-        solve = f"forward solve {max(self._solve, 1)}: {self._made} time steps{of}"
-        return ", ".join([self._title, solve, *self._left()])
-
-    def _say(self, *parts: str) -> None:
-        self._lines.say(", ".join([self._title, *parts, *self._left()]))
+        return ", ".join(
+            [self._title, f"{self._solve}: {self._made} time steps{of}", *self._left()]
+        )
 
     def _left(self) -> list[str]:
         """The elapsed time, and an estimate of the time left."""
@@ -178,8 +171,8 @@ class PartBar:
         self._quiet, self._done, self._spent = quiet, 0, 0.0
         # tqdm's own estimate of the time left knows no workers.
         form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
-        self._bar = tqdm(total=total, desc=title, disable=None, leave=False, bar_format=form)
-        self._lines = Heartbeat(self._bar, self._status)
+        bar = {"total": total, "desc": title, "disable": None, "bar_format": form}
+        self._lines = Heartbeat(self._status, **bar)
         self._last = self._lines.began
 
     def __enter__(self) -> PartBar:
@@ -197,9 +190,9 @@ class PartBar:
         self._last = now
         self._done += 1
         if total is not None:
-            self._total = self._bar.total = total
-        self._bar.set_postfix_str(f"about {duration(self.left())} left", refresh=False)
-        self._bar.update(1)
+            self._total = self._lines.bar.total = total
+        self._lines.bar.set_postfix_str(f"about {duration(self.left())} left", refresh=False)
+        self._lines.bar.update(1)
 
     def left(self) -> float:
         """Seconds until the last piece is done, from the mean time of the finished pieces.

@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar, cast
 
 import experiments.studies
 from experiments.common.records.record import Record
 from experiments.common.records.record import Result as Result
 from experiments.common.schema import Values, hints_of, validated
 from mvest.errors import ConfigurationError
+from mvest.problem.record import EstimateRecord
 from mvest.provenance import NUMBERS
 from mvest.reporting.tables import Table, joined
 
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 S = TypeVar("S")
+
+Figures: TypeAlias = "Figure | Mapping[str, Figure] | None"
+"""A figure, figures by name ("" is the main one), or None if there is nothing to draw."""
 
 STUDIES = Path(experiments.studies.__file__).parent
 
@@ -56,6 +60,16 @@ class Results:
         return next(iter(self.records.values()))
 
     @property
+    def first_arrays(self) -> Path | None:
+        """The file of arrays of the main record, if it has one."""
+        return self.arrays.get(next(iter(self.records)))
+
+    @property
+    def estimates(self) -> list[tuple[Record, EstimateRecord]]:
+        """Each record that has estimates, with its first one."""
+        return [(one, one.estimates[0]) for one in self.records.values() if one.estimates]
+
+    @property
     def is_empty(self) -> bool:
         """Whether all records failed before they had anything to show."""
         return not any(one.tables or one.estimates for one in self.records.values())
@@ -85,8 +99,7 @@ class Study(Generic[S]):
     run: Callable[[Job[S]], Result]
     # Tables for readers, by name. The results' own tables are then written as CSV only.
     summary: Callable[[Results], Mapping[str, Table]] | None = None
-    # A figure, figures by name ("" is the main one), or None if there is nothing to draw.
-    figure: Callable[[Results], Figure | Mapping[str, Figure] | None] | None = None
+    figure: Callable[[Results], Figures] | None = None
     captions: Mapping[str, str] = field(default_factory=dict)  # by name of the figure
     latex: tuple[str, ...] = ()  # names of the paper's own tables and figures: LaTeX and PDF, too
     words: Callable[[Record], str] | None = None  # text for the terminal; None: the tables

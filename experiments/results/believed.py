@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.cases.revealed import revealed
 from experiments.common.records.record import Record
 from experiments.results.published import records_of
 from experiments.results.renewal import chosen, status_of
@@ -40,7 +39,7 @@ class Mode:
         """Its records and estimates."""
         (one,) = (one for one in chosen([self.study]) if one.name == self.study)
         kept = records_of(results, one.table)
-        found = [run for run in revealed(kept) if run[0].experiment == one.values["name"]]
+        found = [run for run in kept.estimates if run[0].experiment == one.values["name"]]
         return [run for run in found if self.takes(run[0])]
 
     def is_stale(self, results: Path) -> bool:

@@ -158,11 +158,7 @@ def _rows(record: Record, place: str | None, **more: Any) -> Iterator[dict[str, 
 
 
 def _typed(rows: list[dict[str, Any]]) -> DataFrame:
-    from pandas import DataFrame, Series
+    from pandas import DataFrame
 
-    return DataFrame(
-        {
-            name: Series([row.get(name) for row in rows], dtype=TYPES[kind])
-            for name, (kind, _, _) in COLUMNS.items()
-        }
-    )
+    kinds = {name: TYPES[kind] for name, (kind, _, _) in COLUMNS.items()}
+    return DataFrame(rows, columns=list(COLUMNS), dtype=object).astype(kinds)

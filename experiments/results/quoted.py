@@ -12,7 +12,6 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from experiments.results.believed import believed
 from mvest.errors import InputError
@@ -48,18 +47,17 @@ def quoted(source: str, results: Path) -> str:
 def _rows(results: Path, name: str) -> Sequence[Mapping[str, str]]:
     """The rows of a table as texts, by headings without units."""
     if name == "believed":
-        return [{k: _text(v) for k, v in row.items()} for row in believed(results).rows]
+        return [
+            {k: "" if v is None else str(v) for k, v in row.items()}
+            for row in believed(results).rows
+        ]
     path = results / f"{name}.csv"
     if not path.is_file():
         raise InputError(f"{path}: there is no such table")
-    lines = path.read_text(encoding="utf-8").splitlines()
-    rows = csv.reader(line for line in lines if not line.startswith("# "))
-    heads = [head.partition(" [")[0] for head in next(rows)]
-    return [dict(zip(heads, row, strict=True)) for row in rows]
-
-
-def _text(value: Any) -> str:
-    return "" if value is None else str(value)
+    with path.open(encoding="utf-8") as file:
+        rows = csv.reader(line for line in file if not line.startswith("# "))
+        heads = [head.partition(" [")[0] for head in next(rows)]
+        return [dict(zip(heads, row, strict=True)) for row in rows]
 
 
 def requoted(text: str, results: Path) -> str:

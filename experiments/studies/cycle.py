@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from experiments.common.building.twin import noise_words
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import Mesh, Number
 from experiments.common.schema import Values
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.closure.cycle import CycleModel, CycleProtocol, compare_time_steps, with_mesh_error
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
@@ -35,9 +35,6 @@ from mvest.reporting.expectation import expectation_text
 from mvest.reporting.skill import estimates_table
 from mvest.reporting.tables import table
 from mvest.typing import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 EXACT, TWO, WHOLE, OTHER = "no noise", "open and closed", "whole cycle", "another mesh"
 """Observations for estimates; all but the second include all frames."""
@@ -209,12 +206,12 @@ def expect_cycle(values: Values, _folder: Path | None = None) -> str:
     at = settings.protocol.frame_sets()[WHOLE]
     rest = model.closure.valve.surface.vertices
     seen = _observation(settings, np.tile(rest, (len(at), 1, 1)), settings.noise_mm, at)
-    noise = noise_words("assumed", [settings.noise_mm], 0.0)
+    noise = noise_words([settings.noise_mm], 0.0)
     with _bar(values["name"], model, 1):
         return expectation_text(f"{values['name']}, {values['row']}", problem, seen, noise)
 
 
-def figure(results: Results) -> Figure:
+def figure(results: Results) -> Figures:
     """Bounds for sets of frames, and the errors of estimates if there are any."""
     from mvest.reporting.figures import COLOURS, MARKERS, SMALL, log_axis, panels
 

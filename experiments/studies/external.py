@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from experiments.common.building.filters import build_filter
 from experiments.common.places import CHECKOUT
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.schema import NOT_HASHED, InputFile, Reads, Values, contents
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.exchange.external.contract import Command, files_of_command, read_points, write_points
@@ -30,9 +30,6 @@ from mvest.problem.record import EstimateRecord, record_of
 from mvest.quantities import Length, Processes, TimeLimit, Tolerance, Value, within
 from mvest.reporting.tables import Column, table
 from mvest.typing import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 POINTS = ("points",)
 """The only frame that models predict."""
@@ -249,7 +246,7 @@ def check_external(values: Values, folder: Path) -> str:
     )
 
 
-def figure(results: Results) -> Figure | None:
+def figure(results: Results) -> Figures:
     """Iterates of each parameter, for each model."""
     from mvest.reporting.figures import iterates_figure
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from experiments.common.building.twin import build_twin
 from experiments.common.progress import SolveBar, say
 from experiments.common.records.record import Mesh
 from experiments.common.schema import BY_PARAMETER, Values
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate
@@ -23,9 +23,6 @@ from mvest.estimation.transform import Log
 from mvest.observation.vertices import observed_frames
 from mvest.quantities import AxisCount, Length, Logarithm, PointsAlong, PointsAround, Value
 from mvest.reporting.tables import Column, table
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 TRANSFORM = Log()
 """All unknowns are positive."""
@@ -198,7 +195,7 @@ def build_problem(config: Values, name: str, about: FilterProblem) -> Problem:
     return Problem(name, about, twin.model, model, prior)
 
 
-def figure(results: Results) -> Figure:
+def figure(results: Results) -> Figures:
     """The 95 % intervals of each filter relative to those of the reference."""
     from textwrap import fill
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,12 +25,9 @@ from experiments.common.building.gate import (
     truth_of,
 )
 from experiments.common.records.record import Mesh
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.reporting.tables import Column, Table, joined, table
 from mvest.typing import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,13 +116,13 @@ CURVES = {
 }
 
 
-def figure(results: Results) -> Figure | None:
+def figure(results: Results) -> Figures:
     """Four moments of a closing valve from the atrium, the side and in section; its measures."""
-    name, record = next(iter(results.records.items()))
-    if name not in results.arrays:
+    if results.first_arrays is None:
         return None
     from matplotlib.figure import Figure
 
+    record = results.first
     values = record.table_of().values
     at_rest = bool(record.numbers["ends_at_rest"])
     moments = _moments(np.array(values["orifice"], dtype=float))
@@ -136,7 +133,7 @@ def figure(results: Results) -> Figure | None:
     }
     drawn = Figure(figsize=(11, 10.4), layout="constrained")
     parts: Any = drawn.subfigures(2, 1, height_ratios=[3.0, 1.0])
-    draw_closing(parts[0], results.arrays[name], titles)
+    draw_closing(parts[0], results.first_arrays, titles)
     _draw_curves(parts[1], values, moments, at_rest)
     drawn.suptitle(
         "A simulated valve closing, from the atrium, from the posterior side and in the middle"

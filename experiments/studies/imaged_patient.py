@@ -7,17 +7,16 @@ segmentation). Errors that remain in these two are not caused by the images.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from scipy.stats import linregress, sem
 
 from experiments.common.building.closure import mechanics_of, template_of
-from experiments.common.cases.calibrated import calibration_figure, calibration_tables
+from experiments.common.cases.calibrated import bias_table, calibration_figure, calibration_tables
 from experiments.common.cases.own_case import (
     ImagedInput,
     PersonalSettings,
@@ -28,15 +27,11 @@ from experiments.common.cases.revealed import (
     MODULUS_COLUMNS,
     Groups,
     estimate_hidden,
-    grouped,
-    groups_figure,
     modulus_row,
-    revealed,
     short,
-    unknowns_of,
 )
 from experiments.common.schema import Values
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence
@@ -47,7 +42,7 @@ from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import MovingValve, ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.observation.errors import SpatialCorrelation
-from mvest.problem.record import UNCALIBRATED, EstimateRecord, Unknown
+from mvest.problem.record import UNCALIBRATED, EstimateRecord
 from mvest.problem.registration import REGISTRATION
 from mvest.problem.stored import entry_of
 from mvest.provenance import write_json
@@ -59,9 +54,6 @@ from mvest.simulation.population import draw_tip_motion
 from mvest.simulation.virtual_patient import PatientSettings, draw_patient_values, first_that_closes
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Made = tuple[DrawnValve, MovingValve, Probe, VolumeSequence, int]
 """A patient, its true motion and imaging, and the number of anatomies drawn for it."""
@@ -254,14 +246,14 @@ def summary(results: Results) -> dict[str, Table]:
     Without better geometries: the calibration of the moduli, and what it does.
     """
     if _is_calibration(results):
-        return calibration_tables([one for _, one in revealed(results)])
+        return calibration_tables([one for _, one in results.estimates])
     groups = _by_source(results)
-    skill = unknowns_of(groups) | unknowns_of(groups, by_name=True)
-    estimates = [estimate for _, estimate in revealed(results)]
+    skill = groups.unknowns() | groups.unknowns(by_name=True)
+    estimates = [estimate for _, estimate in results.estimates]
     tables = {
         "": _moduli_table(estimates),
         "skill": skill_table("estimated from", skill),
-        "bias": _bias(unknowns_of(groups, by_name=True, stated=False)),
+        "bias": bias_table("estimated from", groups.unknowns(by_name=True, stated=False)),
         "verdicts": verdict_table(estimates),
         "chordae": _chordae(results),
     }
@@ -270,9 +262,9 @@ def summary(results: Results) -> dict[str, Table]:
 
 def _by_source(results: Results, *, verdict_of_volume: bool = False) -> Groups:
     """Estimates by source, each with its own verdict or the verdict on the volume's estimate."""
-    return grouped(
+    return Groups.of(
         (source, estimate, own if verdict_of_volume else estimate)
-        for _, own in revealed(results)
+        for _, own in results.estimates
         for name, source in SOURCES.items()
         if not name or name in own.alternatives
         for estimate in (own.alternatives[name] if name else own,)
@@ -280,13 +272,13 @@ def _by_source(results: Results, *, verdict_of_volume: bool = False) -> Groups:
 
 
 def _is_calibration(results: Results) -> bool:
-    return not any({KNOWN, SEGMENTED} & one.alternatives.keys() for _, one in revealed(results))
+    return not any({KNOWN, SEGMENTED} & one.alternatives.keys() for _, one in results.estimates)
 
 
-def _figures(results: Results) -> dict[str, Figure]:
+def _figures(results: Results) -> Figures:
     if _is_calibration(results):
-        return calibration_figure([one for _, one in revealed(results)])
-    return {"moduli": groups_figure(_by_source(results, verdict_of_volume=True))}
+        return calibration_figure([one for _, one in results.estimates])
+    return {"moduli": _by_source(results, verdict_of_volume=True).figure()}
 
 
 def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
@@ -304,26 +296,6 @@ def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
         label = f"error from {SOURCES[name]}"
         about[f"error, {name}"] = replace(MODULUS_COLUMNS["error"], label=label)
     return table(rows, **about)
-
-
-def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
-    """Mean error of each modulus's logarithm, and its slope against the truth, if converged."""
-    rows = []
-    for source, moduli in groups.items():
-        known = [(own.truth, own.estimate) for own in moduli if own.estimate is not None]
-        truth, found = np.log(np.array(known, dtype=np.float64).reshape(-1, 2).T)
-        row = {"estimated from": source, "n": len(known)}
-        row |= dict.fromkeys(("bias", "bias SE", "slope", "slope SE"))
-        if len(known) > 1:
-            row |= {"bias": np.mean(found - truth), "bias SE": sem(found - truth)}
-        if len(known) > 2 and np.ptp(truth) > 0:
-            line = linregress(truth, found)
-            row |= {"slope": line.slope, "slope SE": line.stderr}
-        rows.append(row)
-    bias = Column(digits=".2f", std="bias SE", label="mean error of the logarithm ± SE")
-    slope = Column(digits=".2f", std="slope SE", label="slope over the truth's ± SE")
-    first = {"estimated from": Column(), "n": Column()}
-    return table(rows, **first, bias=bias, slope=slope)
 
 
 def _chordae(results: Results) -> Table:

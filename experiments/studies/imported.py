@@ -13,7 +13,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from experiments.common.building.twin import build_twin, estimate_twin
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
 from experiments.common.schema import InputFile, Reads, Values, contents
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import write_case
 from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
@@ -56,9 +56,6 @@ from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.remesh import layered_wedges
 from mvest.valve.mesh.solid_mesh import SolidMesh
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def recording_folder(recording: str | None, case: str) -> Path:
@@ -350,20 +347,20 @@ def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:
     return record_of(found, seed=values["seed"], case=name, simulated=True)
 
 
-def figure(results: Results) -> Figure | None:
+def figure(results: Results) -> Figures:
     """The closed donor valve with generic and fitted moduli, or the heart valve open and closed."""
     from matplotlib.figure import Figure
 
     from mvest.reporting.case.figures import case_figure
 
-    name, record = next(iter(results.records.items()))
-    if name not in results.arrays:
+    record = results.first
+    if results.first_arrays is None:
         return None
     if "gate" not in record.tables:
-        return case_figure(results.arrays[name])
+        return case_figure(results.first_arrays)
     drawn = Figure(figsize=(8.0, 7.4), layout="constrained")
     titles = {0: "open, as modelled", 1: "closed (simulated)"}
-    draw_closing(drawn, results.arrays[name], titles)
+    draw_closing(drawn, results.first_arrays, titles)
     title = f"{record.title}: only its shape is real"
     drawn.suptitle(f"{title}\n{fill(str(record.numbers['data']), 110)}", fontsize=9)
     return drawn

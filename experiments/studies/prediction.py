@@ -20,7 +20,7 @@ from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin
 from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
 from experiments.common.records.record import Mesh
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.problem.estimate import StudyResult, estimate
@@ -42,7 +42,6 @@ from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from numpy.typing import NDArray
     from pandas import DataFrame
 
@@ -272,7 +271,7 @@ def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]
 
 
 # -- figure ---------------------------------------------------------------------------------------
-def figure(results: Results) -> Figure | None:
+def figure(results: Results) -> Figures:
     """The first patient's closed valve by condition from the atrium, and its measures.
 
     Touching midsurfaces are one thickness apart, so the slit between them is drawn as tissue. Gaps
@@ -285,11 +284,11 @@ def figure(results: Results) -> Figure | None:
     from mvest.reporting.case import drawing
     from mvest.reporting.figures import ATRIUM, SMALL, TEXT
 
-    name, record = next(iter(results.records.items()))
-    if name not in results.arrays:
+    record = results.first
+    if results.first_arrays is None:
         return None
     reach = float(record.numbers["contact_reach_mm"])  # type: ignore[arg-type]
-    valve = replace(case_fields(results.arrays[name], turned=False), reach_mm=reach)
+    valve = replace(case_fields(results.first_arrays, turned=False), reach_mm=reach)
     assert valve.fitted is not None
     rows, failed = record.table_of().frame, record.table_of("not_closed").frame
     drawn = Figure(figsize=(max(2.7 * len(valve.frames), 8.0), 8.6), layout="constrained")

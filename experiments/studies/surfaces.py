@@ -16,12 +16,8 @@ from experiments.common.cases.revealed import (
     MODULUS_COLUMNS,
     Groups,
     estimate_hidden,
-    grouped,
-    groups_figure,
     modulus_row,
-    revealed,
     short,
-    verdicts_and_skill,
 )
 from experiments.common.records.record import Number, Record
 from experiments.common.study import Job, Result, Results, Study
@@ -105,7 +101,7 @@ def summary(results: Results) -> dict[str, Table]:
     hidden = dict.fromkeys(("failed_checks", "ended"), Column(hidden=True))
     return {
         "": table(rows, **about, **MODULUS_COLUMNS, **hidden),
-        "geometries": verdicts_and_skill("geometry", _by_geometry(results)),
+        "geometries": _by_geometry(results).skill("geometry"),
     }
 
 
@@ -120,18 +116,18 @@ def _runs(results: Results) -> list[tuple[Record, EstimateRecord]]:
         numbers = run[0].numbers
         return run[1].case, KINDS.index(str(numbers["kind"])), str(numbers["geometry"])
 
-    return sorted(revealed(results), key=key)
+    return sorted(results.estimates, key=key)
 
 
 def _by_geometry(results: Results) -> Groups:
-    return grouped((str(r.numbers["geometry"]), one, one) for r, one in _runs(results))
+    return Groups.of((str(r.numbers["geometry"]), one, one) for r, one in _runs(results))
 
 
 STUDY = Study(
     settings=Settings,
     run=run_surfaces,
     summary=summary,
-    figure=lambda results: groups_figure(_by_geometry(results)),
+    figure=lambda results: _by_geometry(results).figure(),
     captions={
         "": "Moduli over their true values, by how the geometry arrived, with 95 % intervals. "
         "Simulated."

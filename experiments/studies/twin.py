@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from experiments.common.building.filters import build_filter, observation_varian
 from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin, estimate_twin, expect_twin
 from experiments.common.records.record import Mesh, model_of_values
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult
 from mvest.problem.fields import valve_fields
@@ -25,9 +25,6 @@ from mvest.reporting.tables import Column, Table, table
 from mvest.scenarios.measures import measure_closed
 from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.strain import triangle_strains, weighted_quantiles
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 LOCKING = (
     "note: linear tetrahedra are many times too stiff in bending; moduli estimated with tet4 "
@@ -197,13 +194,13 @@ def summary(results: Results) -> dict[str, Table]:
     return {"": table([*paper, *rows], **whole.columns)}
 
 
-def figure(results: Results) -> dict[str, Figure]:
+def figure(results: Results) -> Figures:
     """Iterates of the main estimate, and the fitted valve if its arrays are stored."""
     from mvest.reporting.case.figures import case_figure
     from mvest.reporting.figures import iterates_figure
 
     name, record = next(iter(results.records.items()))
-    drawn: dict[str, Figure] = {}
+    drawn: dict[str, Any] = {}
     if len(results.records) > 1 and name != record.table:
         return drawn  # there is no main run
     if (iterates := iterates_figure(record.estimates[:1])) is not None:

@@ -245,11 +245,11 @@ def expect_twin(config: Values, _folder: Path | None = None) -> str:
     if data.observation is None:
         return unknown_text(title, first.reason)
     std = np.sqrt(np.atleast_1d(np.asarray(config["filter"]["R"], dtype=float)))
-    noise = noise_words("assumed", std.tolist(), config["filter"]["R_correlation_mm"])
+    noise = noise_words(std.tolist(), config["filter"]["R_correlation_mm"])
     return expectation_text(title, replace(twin.problem, model=model), data.observation, noise)
 
 
-def noise_words(known: str, std_mm: Sequence[float], length_mm: float) -> str:
-    """The noise of coordinates in words; it is "assumed" or "stated"."""
+def noise_words(std_mm: Sequence[float], length_mm: float) -> str:
+    """The assumed noise of coordinates in words."""
     errors = f"correlated over {length_mm:g} mm" if length_mm else "independent"
-    return f"{' and '.join(f'{s:.3g}' for s in std_mm)} mm of noise {known}, {errors}"
+    return f"{' and '.join(f'{s:.3g}' for s in std_mm)} mm of noise assumed, {errors}"

@@ -91,22 +91,34 @@ def calibration_tables(estimates: Sequence[EstimateRecord]) -> dict[str, Table]:
             **about,
         ),
         "skill": skill_table("estimate", groups),
-        "bias": _bias(groups),
+        "bias": bias_table("estimate", groups, of_truth=True),
     }
 
 
-def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
-    """Mean error of the logarithms, and the truths' slope over the estimates: 0 and 1 if right."""
+def bias_table(
+    by: str, groups: Mapping[str, Sequence[Unknown]], *, of_truth: bool = False
+) -> Table:
+    """Mean error of the logarithms, and their slope over the truths', if they have estimates.
+
+    With ``of_truth`` the truths' slope over the estimates, which is 1 after a calibration.
+    """
     rows = []
     for name, own in groups.items():
-        pairs = np.array([(one.estimate, one.truth) for one in own], dtype=np.float64)
-        found, truth = np.log(pairs).T
-        line, error = linregress(found, truth), found - truth
-        row = {"estimate": name, "n": len(own), "bias": error.mean(), "bias SE": sem(error)}
-        rows.append(row | {"slope": line.slope, "slope SE": line.stderr})
-    bias = Column(digits=".3f", std="bias SE", label="mean error of the logarithm ± SE")
-    slope = Column(digits=".2f", std="slope SE", label="the truth's slope over it ± SE")
-    return table(rows, estimate=Column(), n=Column(), bias=bias, slope=slope)
+        known = [(one.truth, one.estimate) for one in own if one.estimate is not None]
+        truth, found = np.log(np.array(known, dtype=np.float64).reshape(-1, 2).T)
+        row = {by: name, "n": len(known), **dict.fromkeys(("bias", "bias SE", "slope", "slope SE"))}
+        if len(known) > 1:
+            row |= {"bias": np.mean(found - truth), "bias SE": sem(found - truth)}
+        if len(known) > 2 and np.ptp(truth) > 0:
+            line = linregress(found, truth) if of_truth else linregress(truth, found)
+            row |= {"slope": line.slope, "slope SE": line.stderr}
+        rows.append(row)
+    digits, text = (
+        (".3f", "the truth's slope over it") if of_truth else (".2f", "slope over the truth's")
+    )
+    bias = Column(digits=digits, std="bias SE", label="mean error of the logarithm ± SE")
+    slope = Column(digits=".2f", std="slope SE", label=f"{text} ± SE")
+    return table(rows, **{by: Column(), "n": Column()}, bias=bias, slope=slope)
 
 
 def calibration_figure(estimates: Sequence[EstimateRecord]) -> dict[str, Figure]:

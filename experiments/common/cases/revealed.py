@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from experiments.common.cases import blind
 from experiments.common.cases.own_case import PersonalSettings
 from experiments.common.records.record import Record
-from experiments.common.study import Result, Results
+from experiments.common.study import Result
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import NONE
@@ -26,11 +26,6 @@ from mvest.reporting.tables import Column, Table, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-# An estimate, and the verdict that counts for it.
-Judged: TypeAlias = tuple[EstimateRecord, str]
-# Estimates by the name of their scenario, data or filter.
-Groups: TypeAlias = Mapping[str, Sequence[Judged]]
 
 NOTHING = dict.fromkeys(("estimate", "std", "low", "high"))
 
@@ -51,57 +46,54 @@ def estimate_hidden(
         return Result(status="failed", reason=str(fault), estimates=(estimate,))
 
 
-def revealed(results: Results) -> list[tuple[Record, EstimateRecord]]:
-    """Record and estimate of each patient that has both."""
-    return [(one, one.estimates[0]) for one in results.records.values() if one.estimates]
+@dataclass(frozen=True, slots=True)
+class Groups:
+    """Estimates by the name of their scenario, data or filter, with the verdicts that count."""
 
+    members: Mapping[str, Sequence[tuple[EstimateRecord, str]]]
 
-def grouped(estimates: Iterable[tuple[str, EstimateRecord, EstimateRecord]]) -> Groups:
-    """Groups from triples: name, estimate, and the estimate whose verdict counts for it."""
-    groups: dict[str, list[Judged]] = {}
-    for name, estimate, own in estimates:
-        groups.setdefault(name, []).append((estimate, trust_of(own)))
-    return groups
+    @classmethod
+    def of(cls, estimates: Iterable[tuple[str, EstimateRecord, EstimateRecord]]) -> Groups:
+        """Groups from triples: name, estimate, and the estimate whose verdict counts for it."""
+        groups: dict[str, list[tuple[EstimateRecord, str]]] = {}
+        for name, estimate, own in estimates:
+            groups.setdefault(name, []).append((estimate, trust_of(own)))
+        return cls(groups)
 
+    def unknowns(
+        self, *, by_name: bool = False, nuisances: bool = False, stated: bool = True
+    ) -> dict[str, list[Unknown]]:
+        """The moduli of each group, with ``nuisances`` all its unknowns.
 
-def unknowns_of(
-    groups: Groups, *, by_name: bool = False, nuisances: bool = False, stated: bool = True
-) -> dict[str, list[Unknown]]:
-    """The moduli of each group, with ``nuisances`` all its unknowns.
+        ``by_name`` divides each group into ``GROUP, UNKNOWN``; ``stated`` leaves out numbers whose
+        verdict is that there is no estimate.
+        """
+        found: dict[str, list[Unknown]] = {}
+        for name, group in self.members.items():
+            for estimate, trust in group:
+                for own in estimate.parameters if nuisances else estimate.moduli:
+                    known = own.model_copy(update=NOTHING) if stated and trust == NONE else own
+                    found.setdefault(f"{name}, {own.name}" if by_name else name, []).append(known)
+        return found
 
-    ``by_name`` divides each group into ``GROUP, UNKNOWN``; ``stated`` leaves out numbers whose
-    verdict is that there is no estimate.
-    """
-    found: dict[str, list[Unknown]] = {}
-    for name, group in groups.items():
-        for estimate, trust in group:
-            for own in estimate.parameters if nuisances else estimate.moduli:
-                known = own.model_copy(update=NOTHING) if stated and trust == NONE else own
-                found.setdefault(f"{name}, {own.name}" if by_name else name, []).append(known)
-    return found
+    def skill(self, by: str, *, stated: bool = True) -> Table:
+        """Number of estimates by group and verdict, and the skill of their moduli.
 
+        ``by`` names the first column; for ``stated`` see `unknowns`.
+        """
+        skill = skill_table(by, self.unknowns(stated=stated))
+        trusts = {name: [trust for _, trust in group] for name, group in self.members.items()}
+        rows = [row | {v: trusts[row[by]].count(v) for v in VERDICTS} for row in skill.rows]
+        return table(rows, **skill.columns)
 
-def verdicts_and_skill(by: str, groups: Groups, *, stated: bool = True) -> Table:
-    """Number of estimates by group and verdict, and the skill of their moduli.
-
-    ``by`` names the first column; for ``stated`` see `unknowns_of`.
-    """
-    skill = skill_table(by, unknowns_of(groups, stated=stated))
-    rows = []
-    for row in skill.rows:
-        trust = [one for _, one in groups[row[by]]]
-        rows.append(row | {verdict: trust.count(verdict) for verdict in VERDICTS})
-    return table(rows, **skill.columns)
-
-
-def groups_figure(groups: Groups) -> Figure:
-    """Moduli against their truths, a band for each group."""
-    return moduli_figure(
-        {
-            name: [(own, trust) for estimate, trust in group for own in estimate.moduli]
-            for name, group in groups.items()
-        }
-    )
+    def figure(self) -> Figure:
+        """Moduli against their truths, a band for each group."""
+        return moduli_figure(
+            {
+                name: [(own, trust) for estimate, trust in group for own in estimate.moduli]
+                for name, group in self.members.items()
+            }
+        )
 
 
 def modulus_row(estimate: EstimateRecord, own: Unknown) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from experiments.common.records.record import Number
 from experiments.common.schema import Values
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore, Seen
 from mvest.cases.from_images.detector_errors import coverage
 from mvest.errors import ConfigurationError, InputError
@@ -41,7 +41,6 @@ from mvest.simulation.trials import (
 from mvest.typing import FloatArray
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 Row = Mapping[str, Any]
@@ -300,7 +299,7 @@ def error_rows(trials: DataFrame) -> DataFrame:
     return plain.assign(unit=plain["error"].map(ERRORS))
 
 
-def figure(results: Results) -> Figure | None:
+def figure(results: Results) -> Figures:
     """Confidence and surface distance in every volume; None if the run only trained."""
     from mvest.reporting.figures import COLOURS, SMALL, headline, log_axis, panels
 

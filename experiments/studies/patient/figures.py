@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import kstwo, norm
 
-from experiments.common.cases.revealed import Groups, unknowns_of
+from experiments.common.cases.revealed import Groups
 from mvest.errors import InputError
 from mvest.problem.record import Spread
 from mvest.problem.verdict import TRUSTWORTHY
@@ -96,14 +96,14 @@ def ranks_figure(scenarios: Groups) -> Figure:
     """
     from mvest.reporting.figures import panels
 
-    columns = max(min(4, len(scenarios)), 1)
-    lines = max(-(-len(scenarios) // columns), 1)
+    columns = max(min(4, len(scenarios.members)), 1)
+    lines = max(-(-len(scenarios.members) // columns), 1)
     drawn, grid = panels(lines, columns, 2.0 * lines + 0.6, sharex=True, sharey=True)
-    for axes, (name, group) in zip(grid.flat, scenarios.items(), strict=False):
+    for axes, (name, group) in zip(grid.flat, scenarios.members.items(), strict=False):
         trusted = sum(trust == TRUSTWORTHY for _, trust in group)
         axes.set_title(f"{name}\n{trusted} of {len(group)} trustworthy", fontsize=8)
         axes.axhline(0.0, color="0.5", lw=0.6)
-        moduli = unknowns_of({"": group}, by_name=True, stated=False)
+        moduli = Groups({"": group}).unknowns(by_name=True, stated=False)
         for (modulus, unknowns), colour in zip(moduli.items(), LEAFLETS, strict=False):
             places = np.sort(norm.cdf([z for own in unknowns if (z := score(own)) is not None]))
             if not (n := len(places)):
@@ -113,7 +113,7 @@ def ranks_figure(scenarios: Groups) -> Figure:
             off = np.searchsorted(places, AT, side="right") / n - AT
             label = modulus.removeprefix(", ").replace(".", " ")
             axes.step(AT, off, where="mid", color=colour, lw=1.2, label=label)
-    for axes in grid.flat[len(scenarios) :]:
+    for axes in grid.flat[len(scenarios.members) :]:
         axes.set_axis_off()
     for axes in grid[-1]:
         axes.set_xlabel("truth in posterior", fontsize=8)

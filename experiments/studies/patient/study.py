@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -22,16 +22,11 @@ from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.own_case import PersonalSettings, case_words, check, write_report
 from experiments.common.cases.revealed import (
     Groups,
-    grouped,
-    groups_figure,
-    revealed,
     short,
-    unknowns_of,
-    verdicts_and_skill,
 )
 from experiments.common.records.record import NOT_GATED, Number, Record
 from experiments.common.schema import Values, build
-from experiments.common.study import Job, Result, Results, Study
+from experiments.common.study import Figures, Job, Result, Results, Study
 from experiments.studies.patient.figures import figure_3, ranks_figure
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
@@ -52,9 +47,6 @@ from mvest.reporting.tables import Column, Table, table
 from mvest.simulation.virtual_patient import PatientSettings
 from mvest.typing import FloatArray
 from mvest.valve.measure.strain import mean_strains
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 POPULATION, CALIBRATION = "population", "calibration"
 """Published tables other than the five patients' table."""
@@ -177,22 +169,21 @@ def summary(results: Results) -> dict[str, Table]:
     estimates = [estimate for _, estimate in patients]
     if which == CALIBRATION:
         scenarios = _by_scenario(patients)
-        trusted = {
-            name: [one for one in group if one[1] == TRUSTWORTHY]
-            for name, group in scenarios.items()
-        }
-        moduli = unknowns_of(scenarios, by_name=True, stated=False)
+        trusted = _by_scenario(
+            [(record, one) for record, one in patients if trust_of(one) == TRUSTWORTHY]
+        )
+        moduli = scenarios.unknowns(by_name=True, stated=False)
         return {
-            "": _with_nees(verdicts_and_skill("scenario", scenarios, stated=False), patients),
-            "trusted": skill_table("scenario", unknowns_of(trusted)),
+            "": _with_nees(scenarios.skill("scenario", stated=False), patients),
+            "trusted": skill_table("scenario", trusted.unknowns()),
             "verdicts": verdict_table(estimates),
             "moduli": skill_table("scenario, modulus", moduli),
             "estimates": _estimates(patients),
         }
     ways, frames = _by_way(estimates), _table3(patients)
-    both = {"moduli": skill_table("estimation", unknowns_of(ways)), "distances": _distances(frames)}
+    both = {"moduli": skill_table("estimation", ways.unknowns()), "distances": _distances(frames)}
     if which == POPULATION:
-        each = unknowns_of(ways, by_name=True, nuisances=True)
+        each = ways.unknowns(by_name=True, nuisances=True)
         return {
             "": skill_table("estimation, unknown", each),
             **both,
@@ -212,7 +203,7 @@ def _patients(results: Results) -> Patients:
         scenario = _scenario(record)
         return five, scenario != REFERENCE, scenario, estimate.case
 
-    return sorted(revealed(results), key=key)
+    return sorted(results.estimates, key=key)
 
 
 def _scenario(record: Record) -> str:
@@ -220,12 +211,12 @@ def _scenario(record: Record) -> str:
 
 
 def _by_scenario(patients: Patients) -> Groups:
-    return grouped((_scenario(record), estimate, estimate) for record, estimate in patients)
+    return Groups.of((_scenario(record), estimate, estimate) for record, estimate in patients)
 
 
 def _by_way(estimates: Sequence[EstimateRecord]) -> Groups:
     """Estimates by unknowns and filter, with the patient's verdict."""
-    return grouped((name, way, one) for one in estimates for name, way in _ways(one).items())
+    return Groups.of((name, way, one) for one in estimates for name, way in _ways(one).items())
 
 
 def _ways(estimate: EstimateRecord) -> dict[str, EstimateRecord]:
@@ -358,11 +349,11 @@ def _with_nees(skill: Table, patients: Patients) -> Table:
 
 
 # -- figures --------------------------------------------------------------------------------------
-def figure(results: Results) -> dict[str, Figure]:
+def figure(results: Results) -> Figures:
     """Figure 3, or the figure of the population or of the scenarios."""
     patients = _patients(results)
     if results.first.table == POPULATION:
-        return {"moduli": groups_figure(_by_way([estimate for _, estimate in patients]))}
+        return {"moduli": _by_way([estimate for _, estimate in patients]).figure()}
     if results.first.table == CALIBRATION:
         return {"ranks": ranks_figure(_by_scenario(patients))}
     from mvest.problem.fields import case_fields
