@@ -10,19 +10,20 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from textwrap import TextWrapper
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
 from mvest.typing import FloatArray
 
+if TYPE_CHECKING:
+    from mvest.closure.model import ClosureModel
+
 SILENCE_S = 10.0  # longest time without a sign of life
 WIDTH = 100  # characters of a line of a terminal
-
-TYPICAL_SOLVES = 6
-"""Forward solves that a filter usually needs; only the first guess of what is left."""
 
 
 def duration(seconds: float) -> str:
@@ -82,21 +83,19 @@ class SolveBar:
     """Reports steps of a filter; a bar moves with the time steps of a forward solve.
 
     ``steps`` is the number of time steps of one solve; 0 for a model that reports none, which gets
-    no bar. ``solves`` are expected, and after these one more at a time. ``names`` are those of the
-    parameters of :meth:`iterate`. If solves are not most of the work, ``whole`` is the expected
-    time of everything in units of the first solve.
+    no bar. ``names`` are those of the parameters of :meth:`iterate`, and ``whole`` is the expected
+    time of everything in units of the first solve, if it is known.
     """
 
     def __init__(
-        self, title: str, steps: int, solves: int, names: Sequence[str] = (), whole: float = 0.0
+        self, title: str, steps: int, names: Sequence[str] = (), whole: float = 0.0
     ) -> None:
-        self._title, self._steps, self._expected = title, steps, solves
-        self._names, self._whole = list(names), whole
+        self._title, self._steps, self._names, self._whole = title, steps, list(names), whole
         self._made, self._reached = 0, math.inf  # steps of the present solve, and its time
-        self._spent: list[float] = []  # on each solve that has ended
+        self._solve, self._first = 1, 0.0  # number of the present solve, and seconds of the first
         bar = {"total": steps, "desc": title, "unit": "step", "disable": None if steps else True}
         self._lines = Heartbeat(self._status, **bar)
-        self._began = self._now = self._lines.began
+        self._now = self._lines.began
 
     def __enter__(self) -> SolveBar:
         return self
@@ -109,7 +108,9 @@ class SolveBar:
         if time_s <= self._reached:
             self._end_solve()
             self._lines.bar.reset()
-            self._lines.bar.set_description(f"{self._title}, {self._solve}", refresh=False)
+            self._lines.bar.set_description(
+                f"{self._title}, forward solve {self._solve}", refresh=False
+            )
         self._reached, self._now = time_s, time.monotonic()
         self._made += 1
         self._lines.bar.update(1)
@@ -117,7 +118,6 @@ class SolveBar:
     def iterate(self, number: int, m: FloatArray, objective: float) -> None:
         """One more iterate of a filter: its number, the parameters (p,) and the objective."""
         self._end_solve()
-        self._began = time.monotonic()
         names = self._names
         if len(names) != len(m):  # a first stage estimates the moduli alone
             names = [name for name in names if name.startswith("E_f.")]
@@ -127,34 +127,30 @@ class SolveBar:
 
     def _end_solve(self) -> None:
         if self._made:
-            self._spent.append(self._now - self._began)
-            self._began, self._made, self._reached = self._now, 0, math.inf
-
-    @property
-    def _solve(self) -> str:
-        return f"forward solve {len(self._spent) + 1}"
+            self._first = self._first or self._now - self._lines.began
+            self._solve, self._made, self._reached = self._solve + 1, 0, math.inf
 
     def _status(self) -> str:
         """Progress within a solve."""
         of = f" of {self._steps}" if self._steps >= self._made else ""
-        return ", ".join(
-            [self._title, f"{self._solve}: {self._made} time steps{of}", *self._left()]
-        )
+        solve = f"forward solve {self._solve}: {self._made} time steps{of}"
+        return ", ".join([self._title, solve, *self._left()])
 
     def _left(self) -> list[str]:
-        """The elapsed time, and an estimate of the time left."""
+        """The elapsed time, and an estimate of the time left if the whole is known."""
         elapsed = self._lines.elapsed
-        text = [f"{duration(elapsed)} elapsed"]
-        if self._whole and self._spent:
-            left = self._whole * self._spent[0] - elapsed
-            return [*text, f"about {duration(left)} left"] if left > 0.1 * elapsed else text
-        # The first solve starts from the open valve. Later ones continue it and are quicker.
-        if not (later := self._spent[1:]):
-            return text
-        each = sum(later) / len(later)
-        if (more := self._expected - len(self._spent)) > 0:
-            return [*text, f"about {duration(each * more)} left if {self._expected} solves do"]
-        return [*text, f"about {duration(each)} for each further solve"]
+        left = self._whole * self._first - elapsed
+        more = [f"about {duration(left)} left"] if left > 0.1 * elapsed else []
+        return [f"{duration(elapsed)} elapsed", *more]
+
+
+@contextmanager
+def solving(title: str, model: ClosureModel, names: Sequence[str] = ()) -> Iterator[SolveBar]:
+    """A bar that a model of the closure moves; ``names`` as in `SolveBar`."""
+    with SolveBar(title, len(model.settings.protocol.steps()), names) as bar:
+        model.on_step = bar.step
+        yield bar
+        model.on_step = None
 
 
 class PartBar:

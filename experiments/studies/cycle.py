@@ -17,7 +17,7 @@ from experiments.common.building.closure import closure_model
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import noise_words
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.progress import SolveBar
 from experiments.common.records.record import Mesh, Number
 from experiments.common.schema import Values
 from experiments.common.study import Figures, Job, Result, Results, Study
@@ -72,7 +72,7 @@ def run_cycle(job: Job[CycleSettings]) -> Result:
     values, settings = job.values, job.settings
     truth = np.array(values["truth"]["values"], dtype=float)
     model = CycleModel(closure_model(values), settings.protocol)
-    with _bar("true cycle", model, 1):
+    with _bar("true cycle", model):
         true = predict(model, truth, derivatives=True)
     if not true.converged:
         raise InputError(f"the truth has no cycle: {true.reason}")
@@ -91,7 +91,7 @@ def run_cycle(job: Job[CycleSettings]) -> Result:
     if dts := settings.time_steps:
         path = np.tile(truth, (settings.path_steps + 1, 1))
         path[:, 0] *= np.linspace(1.0, 1.0 + PATH_CHANGE, len(path))
-        with _bar("time steps", model, len(dts) * len(path)):
+        with _bar("time steps", model):
             steps = compare_time_steps(model, dts, path)
         tables["time_steps"] = table(steps, dt="s", change="mm", unevenness=":.1f")
         solves += len(dts) * len(path)
@@ -138,7 +138,7 @@ def _estimates(
             positions = shown + noise * np.random.default_rng(seed).normal(size=shown.shape)
             seen = _observation(settings, positions, noise or settings.exact_assumed_mm, at)
             label = f"{what}, errors {seed}" if what == WHOLE else what
-            with _bar(label, model, TYPICAL_SOLVES, problem.parameters) as bar:
+            with _bar(label, model, problem.parameters) as bar:
                 result = estimate(problem, seen, on_iterate=bar.iterate)
             result = result.against(Truth(problem.parameters, truth, frames[at]))
             yield record_of(result, seed=seed, case=label, simulated=True)
@@ -174,9 +174,9 @@ def _on_mesh(values: Values, settings: CycleSettings, mesh: tuple[int, ...]) -> 
     return CycleModel(closure_model(changed), replace(settings.protocol, dt=dt))
 
 
-def _bar(title: str, model: CycleModel, solves: int, names: Sequence[str] = ()) -> SolveBar:
+def _bar(title: str, model: CycleModel, names: Sequence[str] = ()) -> SolveBar:
     """A progress bar for a model's steps."""
-    bar = SolveBar(title, len(model.protocol.steps()), solves, names)
+    bar = SolveBar(title, len(model.protocol.steps()), names)
     model.closure.on_step = bar.step
     return bar
 
@@ -207,7 +207,7 @@ def expect_cycle(values: Values, _folder: Path | None = None) -> str:
     rest = model.closure.valve.surface.vertices
     seen = _observation(settings, np.tile(rest, (len(at), 1, 1)), settings.noise_mm, at)
     noise = noise_words([settings.noise_mm], 0.0)
-    with _bar(values["name"], model, 1):
+    with _bar(values["name"], model):
         return expectation_text(f"{values['name']}, {values['row']}", problem, seen, noise)
 
 

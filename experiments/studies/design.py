@@ -15,7 +15,7 @@ import numpy as np
 from experiments.common.building.closure import closure_model, mechanics_of, template_of
 from experiments.common.building.filters import require_one_each
 from experiments.common.cases.own_case import PersonalSettings, settings_of
-from experiments.common.progress import SolveBar, say
+from experiments.common.progress import say, solving
 from experiments.common.records.record import NOT_GATED, Mesh
 from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
@@ -152,8 +152,7 @@ def _jacobians(
     for pressure in (*settings.pressures_mmHg, peak):
         at = replace(protocol, pressure_mmHg=pressure)
         own = replace(model, settings=replace(model.settings, protocol=at))
-        with SolveBar(f"closed at {pressure:g} mmHg", len(at.steps()), 1) as bar:
-            own.on_step = bar.step
+        with solving(f"closed at {pressure:g} mmHg", own):
             found = own(truth)
         if not found.converged:
             raise GeometryError(f"closed at {pressure:g} mmHg: {found.reason}")

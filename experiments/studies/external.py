@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments.common.building.filters import build_filter
 from experiments.common.places import CHECKOUT
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.progress import SolveBar
 from experiments.common.schema import NOT_HASHED, InputFile, Reads, Values, contents
 from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.errors import ConfigurationError, InputError
@@ -178,7 +178,7 @@ def run(job: Job[ExternalSettings]) -> Result:
     for (source, y), name in product(data.items(), about.models or ("model",)):
         model, title = model_of(about, names, name, len(y), job.folder), f"{name}, from {source}"
         seen = Observation(POINTS, y[None], np.array(noise_mm**2), predicted=POINTS)
-        with SolveBar(title, 0, TYPICAL_SOLVES, names) as bar:
+        with SolveBar(title, 0, names) as bar:
             found = estimate(replace(problem, model=model), seen, on_iterate=bar.iterate)
         if found.fitted is not None and not about.models:
             write_points(job.folder / FITTED, found.fitted[-1])

@@ -131,7 +131,7 @@ class Problem:
             raise ConfigurationError(f"{self.name}: the true valve fails: {exact.reason}")
         errors = np.random.default_rng(seed).standard_normal(exact.y.shape)
         self.closure.restart(None)
-        with SolveBar(self.name, 0, 0, about.parameters) as bar:
+        with SolveBar(self.name, 0, about.parameters) as bar:
             y, R = exact.y + about.noise_mm * errors, about.noise_mm**2
             how: dict[str, Any] = {
                 "names": about.parameters,

@@ -28,7 +28,7 @@ from experiments.common.building.gate import (
     gate_rows,
 )
 from experiments.common.building.twin import build_twin, estimate_twin
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.progress import solving
 from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
 from experiments.common.schema import InputFile, Reads, Values, contents
 from experiments.common.study import Figures, Job, Result, Results, Study
@@ -220,10 +220,9 @@ def _donor(job: Job[Settings]) -> Result:
     valve = recorded_valve(values, donor)
     seen = Observation(("closed",), valve.seen[None], np.asarray(values["filter"]["R"]))
     how = {"continuation": values["continuation"], "largest_change": LARGEST_CHANGE}
-    steps, records, rows, shapes = len(valve.settings.protocol.steps()), [], [], {}
-    with SolveBar("donor", steps, TYPICAL_SOLVES * len(starts), parameters) as bar:
-        first = valve.model(parameters, repeat=False, **how)
-        first.on_step = bar.step
+    records, rows, shapes = [], [], {}
+    first = valve.model(parameters, repeat=False, **how)
+    with solving("donor", first, parameters) as bar:
         # A start may differ by the rounding error of its logarithm.
         known = Remembered(first, rtol=1e-12)
         generic: Prediction = known(prior.mean)

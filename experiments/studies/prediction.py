@@ -18,7 +18,7 @@ from experiments.common.building.closure import anatomy_of, build_mesh, mesh_sto
 from experiments.common.building.filters import require_one_each
 from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin
-from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
+from experiments.common.progress import PartBar, solving
 from experiments.common.records.record import Mesh
 from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
@@ -181,11 +181,8 @@ def _patient(
         return StudyResult.failed(twin.problem, data.reason), {}
     # Start from the open valve, so that patients do not depend on each other.
     twin.model.restart(None)
-    steps = len(twin.model.settings.protocol.steps())
-    with SolveBar(f"patient {seed}", steps, TYPICAL_SOLVES, twin.problem.parameters) as bar:
-        twin.model.on_step = bar.step
+    with solving(f"patient {seed}", twin.model, twin.problem.parameters) as bar:
         result = estimate(twin.problem, data.observation, on_iterate=bar.iterate)
-    twin.model.on_step = None
     result = result.against(data.truth)
     if result.filtered is None or not result.converged:
         return result, {}

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from experiments.common.building.closure import anatomy_of, closure_model
 from experiments.common.places import GATE_RECORDS
-from experiments.common.progress import SolveBar, say
+from experiments.common.progress import say, solving
 from experiments.common.records.record import FAILED_GATE, NOT_GATED, PASSED_GATE
 from experiments.common.schema import Values, build
 from mvest.cache import content_digest
@@ -199,8 +199,7 @@ def truth_of(values: Mapping[str, Any]) -> FloatArray:
 def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
     """Close the configured valve with the true moduli; ``name`` is shown with the progress."""
     model = closure_model(values)
-    with SolveBar(name, len(model.settings.protocol.steps()), 1) as bar:
-        model.on_step = bar.step
+    with solving(name, model):
         result = model.close(truth_of(values), sensitivities=False, every_frame=True)
     grid = band_grid(values["observation"]["columns"], values["observation"]["rows"])
     return Closing(model, result, anatomy_of(values).normal(grid.phi, grid.s))

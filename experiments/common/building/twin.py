@@ -18,7 +18,7 @@ from experiments.common.building.closure import (
     mesh_store,
 )
 from experiments.common.building.filters import build_filter, observation_variance, require_one_each
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.progress import solving
 from experiments.common.schema import Values, validated
 from mvest.cache import content_digest
 from mvest.closure.model import ClosureModel
@@ -213,15 +213,11 @@ def build_twin(config: Values) -> Twin:
 def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[StudyResult]:
     """One estimate for each seed; they share truth and first closure; ``name`` is displayed."""
     of_name = f", {name}" if name else ""
-    steps = len(twin.truth_model.settings.protocol.steps())
-    with SolveBar(f"observation{of_name}", steps, 1) as bar:
-        twin.truth_model.on_step = bar.step
+    with solving(f"observation{of_name}", twin.truth_model):
         truth = twin.source(twin.truth_values)
     problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
     results = []
-    steps, solves = len(twin.model.settings.protocol.steps()), TYPICAL_SOLVES * len(seeds)
-    with SolveBar(f"estimation{of_name}", steps, solves, problem.parameters) as bar:
-        twin.model.on_step = bar.step
+    with solving(f"estimation{of_name}", twin.model, problem.parameters) as bar:
         for seed in seeds:
             rng = np.random.default_rng(seed)
             data = twin.observe(lambda m: truth, values=twin.truth_values, rng=rng)
@@ -237,8 +233,7 @@ def expect_twin(config: Values, _folder: Path | None = None) -> str:
     twin = build_twin(config)
     start = twin.problem.start
     model = SharedStart(twin.model, start)
-    with SolveBar(config["name"], len(twin.model.settings.protocol.steps()), 1) as bar:
-        twin.model.on_step = bar.step
+    with solving(config["name"], twin.model):
         first = model(start)
     title = f"{config['name']}, {config['row']}"
     data = twin.observe(model, values=start, rng=np.random.default_rng(0))

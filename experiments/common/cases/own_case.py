@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from experiments.common.building.closure import mechanics_of, mesh_store
-from experiments.common.progress import PartBar, SolveBar, say
+from experiments.common.progress import PartBar, SolveBar, say, solving
 from experiments.common.records.record import FIELDS, NOT_GATED, Mesh, Model, Record, has_passed
 from experiments.common.schema import InputFile, Reads, Values, build, contents
 from experiments.common.study import Result
@@ -127,7 +127,7 @@ def run_case(
     steps = len(settings.mechanics.protocol.steps())
     free = [u.name for u in settings.unknowns if not u.fixed]
     names = sorted(free, key=lambda name: name in REGISTRATION)  # the order of estimation
-    with SolveBar(case.name, steps, 0, names, WHOLE) as bar:
+    with SolveBar(case.name, steps, names, WHOLE) as bar:
         fit = personalise(
             case, settings, store=mesh_store(values), on_step=bar.step, on_iterate=bar.iterate
         )
@@ -241,8 +241,7 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
     )
     expected = Expected(reason="an open frame alone, from which nothing can be estimated")
     if case.closed is not None:
-        with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
-            coarse.on_step = bar.step
+        with solving(case.name, coarse):
             expected = expect_case(case, settings, coarse)
     of = "the generic valve, closed on a coarse mesh"
     if not expected.physiology:
