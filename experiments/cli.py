@@ -196,14 +196,19 @@ def quoted(text: str) -> str:
     return "'" + doubled.replace("'", r"\'").replace("${", r"\${") + "'"
 
 
+def comment_of(text: str) -> str:
+    """The leading comment of a configuration file."""
+    (comment,) = re.findall(r"\A(?:#.*\n)*", text)
+    lines = (line[1:].strip() for line in comment.splitlines() if "@package" not in line)
+    return " ".join(lines)
+
+
 def experiments_in(folder: Path) -> dict[str, str]:
     """Name of every experiment -> first sentence of its leading comment, or else its title."""
     found = {}
     for path in sorted(folder.glob("*.yaml")):
         text = path.read_text(encoding="utf-8")
-        (comment,) = re.findall(r"\A(?:#.*\n)*", text)
-        lines = [line.lstrip("# ") for line in comment.splitlines() if "@package" not in line]
-        sentence = re.match(r".+?[.?!](?=\s|$)", " ".join(lines))
+        sentence = re.match(r".+?[.?!](?=\s|$)", comment_of(text))
         title = re.search(r"^title: *(.*)$", text, re.M)
         found[path.stem] = sentence[0] if sentence else title[1].strip("'\"") if title else ""
     return found

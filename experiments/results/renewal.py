@@ -7,7 +7,6 @@ follows have changed (`mvest.provenance.NUMBERS`).
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -20,7 +19,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from experiments.cli import quoted
+from experiments.cli import comment_of, quoted
 from experiments.common.config import register
 from experiments.common.places import CONF
 from experiments.common.progress import say
@@ -136,13 +135,6 @@ def configured(folder: Path) -> list[Configured]:
         return of_base | own[stem] | ({"hydra": hydra} if hydra else {})
 
     return [Configured(folder.name, one, inherited(one), comment_of(texts[one])) for one in own]
-
-
-def comment_of(text: str) -> str:
-    """The leading comment of a configuration file."""
-    (comment,) = re.findall(r"\A(?:#.*\n)*", text)
-    lines = (line[1:].strip() for line in comment.splitlines() if "@package" not in line)
-    return " ".join(lines)
 
 
 @cache

@@ -17,7 +17,6 @@ from experiments.common.building.gate import (
     anatomy_digest,
     close_valve,
     closed_tables,
-    closures_of,
     draw_closing,
     gate_of,
     gate_report,
@@ -46,7 +45,7 @@ def _gate(job: Job[GateSettings]) -> Result:
     values = job.values
     report = gate_report(values)
     model, truth = closure_model(values), truth_of(values)
-    reference, closures = report.rows[0], closures_of(report)
+    reference, closures = report.rows[0], report.closures
     closed = closed_tables(model, model.close(truth, sensitivities=False), truth)
     verdict = {"passed": report.passed, "closures": closures}
     return Result(

@@ -22,7 +22,6 @@ from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import (
     anatomy_digest,
     close_valve,
-    closures_of,
     draw_closing,
     gate_report,
     gate_rows,
@@ -333,7 +332,7 @@ def _heart(job: Job[Settings]) -> Result:
         status="failed" if failed else "converged",
         reason=failed[0] if failed else "completed",
         mesh=Mesh.of(closing.model.mesh),
-        forward_solves=1 + closures_of(gate),
+        forward_solves=1 + gate.closures,
         gate=f"{PASSED_GATE if gate.passed else FAILED_GATE} on {values['mesh']['columns']} x "
         f"{values['mesh']['rows']} hex18",
     )

@@ -102,6 +102,11 @@ class GateReport:
         """The verdict."""
         return all(row.passed for row in self.rows) and all(path.passed for path in self.paths)
 
+    @property
+    def closures(self) -> int:
+        """Number of closures that were computed."""
+        return len(self.rows) + sum(path.closures for path in self.paths)
+
 
 def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
     """A fresh model that closes from the open valve, with a case's changes except the mesh.

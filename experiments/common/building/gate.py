@@ -55,11 +55,6 @@ def gate_report(values: Values) -> GateReport:
     )
 
 
-def closures_of(report: GateReport) -> int:
-    """Number of closures that a report needed."""
-    return len(report.rows) + sum(path.closures for path in report.paths)
-
-
 def gate_rows(report: GateReport) -> Table:
     """A row for each variation, and for each path along moduli (``along E_f``).
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from experiments import cli
+from experiments.cli import comment_of
 from experiments.common.records.record import Record, read_record, write_record
 from experiments.results.published import records_of, write_records
 from experiments.results.renewal import (
     Configured,
     chosen,
-    comment_of,
     published,
     share,
     status_of,
