@@ -7,7 +7,7 @@ run as it is configured.
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,8 +72,8 @@ def publish_runs(runs: Iterable[tuple[str | None, Record | None, Path, Path]]) -
         if name and record and (record.converged or load_study(record.study).keeps_failures):
             group = results, record.study, record.table
             groups.setdefault(group, {})[name] = record, folder
-    for (results, study, _), named in groups.items():
-        publish(load_study(study), results, named)
+    for (results, study, table), named in groups.items():
+        publish(load_study(study), results, table, named)
         print(f"Results in {results}")
 
 
@@ -93,21 +93,28 @@ def arrays_of(folder: Path, name: str) -> dict[str, Path]:
 
 
 def publish(
-    study: Study[Any], results: Path, runs: Mapping[str, tuple[Record, Path]]
+    study: Study[Any],
+    results: Path,
+    table: str,
+    runs: Mapping[str, tuple[Record, Path]],
+    gone: Collection[str] = (),
 ) -> list[Path]:
-    """Publish records of one table, and write again what follows from them.
+    """Publish records of a table, remove those that are ``gone``, and write what follows again.
 
-    ``runs`` maps names to record and output folder of at least one run; the folder of all results
-    is made if missing. Raises an `InputError` if a file cannot be written.
+    ``runs`` maps names to record and output folder; the folder of all results is made if missing.
+
+    Raises an `InputError` if a file cannot be written.
     """
-    (table,) = {record.table for record, _ in runs.values()}
     place = results / RECORDS
     arrays: dict[str, Path] = {}
     try:
         place.mkdir(parents=True, exist_ok=True)
         # Several processes may publish at the same time.
         with FileLock(results / f".{table}.lock"):
-            records = dict(records_of(results, table).records)
+            before = records_of(results, table).records
+            records = {name: record for name, record in before.items() if name not in gone}
+            for name in gone:
+                _arrays(results, table, name).unlink(missing_ok=True)
             for name, (record, folder) in runs.items():
                 own = arrays_of(folder, name)
                 stored = study.keep_arrays(record, own[name]) if own else {}
@@ -123,20 +130,6 @@ def publish(
             return write_results(results, study, shown)
     except OSError as error:
         raise cannot_write(place, error) from error
-
-
-def unpublish(study: Study[Any], results: Path, table: str, names: Iterable[str]) -> None:
-    """Remove records of a table, and write again what follows from the others."""
-    gone = set(names)
-    if not gone:
-        return
-    with FileLock(results / f".{table}.lock"):
-        records = records_of(results, table).records
-        left = {name: record for name, record in records.items() if name not in gone}
-        for name in gone:
-            _arrays(results, table, name).unlink(missing_ok=True)
-        write_records(results, table, left)
-        write_results(results, study, records_of(results, table))
 
 
 def regenerate(results: Path) -> list[Path]:

@@ -25,7 +25,7 @@ from experiments.common.places import CONF
 from experiments.common.progress import say
 from experiments.common.records.record import Record
 from experiments.common.study import is_present, load_study
-from experiments.results.published import publish_as, records_of, unpublish
+from experiments.results.published import publish, publish_as, records_of
 from experiments.runner.compose import expand, make_plan
 from experiments.runner.jobs import Request
 from experiments.runner.plan import Plan
@@ -260,8 +260,9 @@ def renew(one: Configured, results: Path, take: slice = slice(None)) -> int:
     finally:
         now = one.records(results)
         today = one.of_today(now, plan.jobs)
-        if one.group != "sweep" and today:
-            unpublish(load_study(plan.common["study"]), results, one.table, now.keys() - today)
+        gone = now.keys() - today
+        if one.group != "sweep" and today and gone:
+            publish(load_study(plan.common["study"]), results, one.table, {}, gone)
     hashes = {job.config_hash for job in todo}
     lost = [r for r in found.records if not r.converged and r.provenance.config_hash in hashes]
     return len(lost)

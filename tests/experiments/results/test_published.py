@@ -19,7 +19,7 @@ from tests.places import ROOT
 
 def kept(results, name: str, record: Record) -> None:
     """Publish a made-up run that left no arrays."""
-    publish(STUDY, results, {name: (record, results / "no such folder")})
+    publish(STUDY, results, record.table, {name: (record, results / "no such folder")})
 
 
 def files(folder, table: str) -> dict[str, bytes]:

@@ -135,7 +135,7 @@ def published(folder, estimates):
         for k, one in enumerate(estimates)
     }
     runs = {name: (record, folder / "none") for name, record in records.items()}
-    return publish(imaged_patient.STUDY, folder, runs)
+    return publish(imaged_patient.STUDY, folder, "volume_calibration", runs)
 
 
 def test_a_calibration_is_published_with_each_patient_left_out(tmp_path):

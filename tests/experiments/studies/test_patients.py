@@ -59,7 +59,7 @@ def test_publishing_keeps_a_patient_and_writes_the_tables_again(tmp_path, monkey
     stored = arrays(np.random.default_rng(1))
     known = {k: np.nan_to_num(v, nan=1.0) for k, v in stored.items() if k.startswith("distance")}
     np.savez(folder / "fields.npz", **stored | known)
-    written = publish(STUDY, tmp_path, {"patients-normal-small": (patient(), folder)})
+    written = publish(STUDY, tmp_path, "patients", {"patients-normal-small": (patient(), folder)})
     names = {path.name for path in written}
     # The paper has Tables 2 and 3.
     printed = {"patients_table_2.tex", "patients_table_3.tex", "patients_figure_3.pdf"}
@@ -71,7 +71,7 @@ def test_publishing_keeps_a_patient_and_writes_the_tables_again(tmp_path, monkey
     assert not estimate.details
     with np.load(tmp_path / "records" / "patients" / "patients-normal-small.npz") as found:
         assert set(found.files) <= set(KEPT_ARRAYS)
-    publish(STUDY, tmp_path, {"patients-prolapse": (patient("prolapse"), folder)})
+    publish(STUDY, tmp_path, "patients", {"patients-prolapse": (patient("prolapse"), folder)})
     assert "prolapse" in (tmp_path / "patients_table_2.csv").read_text()
 
 
