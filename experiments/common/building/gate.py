@@ -191,10 +191,10 @@ def truth_of(values: Mapping[str, Any]) -> FloatArray:
     return np.array(values["truth"]["values"], dtype=float)
 
 
-def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
-    """Close the configured valve with the true moduli; ``name`` is shown with the progress."""
+def close_valve(values: Mapping[str, Any]) -> Closing:
+    """Close the configured valve with the true moduli."""
     model = closure_model(values)
-    with solving(name, model):
+    with solving("closure", model):
         result = model.close(truth_of(values), sensitivities=False, every_frame=True)
     grid = band_grid(values["observation"]["columns"], values["observation"]["rows"])
     return Closing(model, result, anatomy_of(values).normal(grid.phi, grid.s))
