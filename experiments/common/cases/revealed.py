@@ -87,7 +87,7 @@ class Groups:
         return table(rows, **skill.columns)
 
     def figure(self) -> Figure:
-        """Moduli against their truths, a band for each group."""
+        """Moduli over their truths, a panel for each group and modulus."""
         return moduli_figure(
             {
                 name: [(own, trust) for estimate, trust in group for own in estimate.moduli]
