@@ -104,7 +104,8 @@ def test_every_number_of_the_documentation_has_a_source():
 
 def test_modes_of_use_agree_with_the_tables_of_their_studies():
     rows = {row["mode"]: row for row in believed(RESULTS).rows}
-    assert set(rows) == {mode.name for mode in MODES}
+    assert set(rows) == {mode.name for mode in MODES if mode.runs(RESULTS)}
+    assert len(rows) >= 5
     for mode, key, source in (
         ("volume", "median error", "volume_skill > the volume > median error"),
         ("volume", "guess", "volume_skill > the volume > generic guess"),
