@@ -168,8 +168,9 @@ def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
         axes.set(xlabel="iteration", ylabel=unknown.name + unit)
         axes.xaxis.get_major_locator().set_params(integer=True)
     where: Any = "outside upper center"
-    keys = grid[0].get_legend_handles_labels()
-    figure.legend(*keys, loc=where, ncols=3, frameon=False, fontsize=SMALL)
+    handles, labels = grid[0].get_legend_handles_labels()
+    across = 3 if max(map(len, labels)) <= 30 else 2
+    figure.legend(handles, labels, loc=where, ncols=across, frameon=False, fontsize=SMALL)
     return figure
 
 
