@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import itertools
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest, mannwhitneyu, norm
 
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
@@ -122,6 +122,9 @@ def share_bounds(inside: int, n: int) -> tuple[float, float]:
 ACROSS = 4
 """Panels of `moduli_figure` side by side, at most."""
 
+SAMPLES, SEED = 1000, 1
+"""Number of samples of the cases in `warning_table`, and the seed of their generator."""
+
 VERDICTS = (TRUSTWORTHY, DOUBTFUL, NONE)
 COLOURS = {TRUSTWORTHY: "#2b6ca3", DOUBTFUL: "#d08a2e", NONE: "#a9a9a9", "": "0.2"}
 """Of verdicts in figures."""
@@ -218,6 +221,45 @@ def verdict_table(estimates: Sequence[EstimateRecord]) -> Table:
         for trust in VERDICTS
     }
     return skill_table("verdict", groups)
+
+
+def warning_table(estimates: Sequence[EstimateRecord]) -> Table:
+    """How well verdicts warn of intervals of moduli that miss the truth.
+
+    The area under the receiver operating characteristic is the probability that a missed interval
+    has a worse verdict than one that holds, where equal verdicts count half (Hanley and McNeil
+    1982, Radiology 143:29): 1 if verdicts always warn, 0.5 if they say nothing. Its 95 % interval
+    comes from samples of the cases with replacement, because scenarios share their cases. It is
+    None if no interval, or every interval, misses.
+    """
+    cases = sorted({one.case for one in estimates})
+    numbers = np.array(
+        [
+            (cases.index(one.case), VERDICTS.index(trust_of(one)), not own.inside)
+            for one in estimates
+            for own in one.moduli
+            if own.inside is not None and trust_of(one) in VERDICTS
+        ]
+    ).reshape(-1, 3)
+    of_case = [numbers[numbers[:, 0] == k] for k in range(len(cases))]
+
+    def area(chosen: Iterable[int]) -> float:
+        _, verdict, missed = np.concatenate([of_case[k] for k in chosen]).T
+        one, other = verdict[missed == 1], verdict[missed == 0]
+        if not one.size or not other.size:
+            return np.nan
+        return float(mannwhitneyu(one, other).statistic) / (one.size * other.size)
+
+    n, missed = len(numbers), int(numbers[:, 2].sum())
+    found, low, high = None, None, None
+    if 0 < missed < n:
+        picks = np.random.default_rng(SEED).integers(len(cases), size=(SAMPLES, len(cases)))
+        low, high = np.nanpercentile([area(chosen) for chosen in picks], (2.5, 97.5))
+        found = area(range(len(cases)))
+    row = {"intervals": n, "missed": missed, "area": found, "low": low, "high": high}
+    about = {"intervals": Column(), "missed": Column()}
+    about["area"] = Column(digits=".2f", low="low", high="high", label="area under the curve")
+    return table([row], **about | dict.fromkeys(("low", "high"), Column(hidden=True)))
 
 
 def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure:

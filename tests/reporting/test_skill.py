@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mvest.problem.record import EstimateRecord, Unknown
-from mvest.problem.verdict import NONE, TRUSTWORTHY, Verdict
+from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Verdict
 from mvest.reporting.skill import (
     log_width,
     prior_alone,
@@ -11,6 +11,7 @@ from mvest.reporting.skill import (
     skill,
     stated,
     trust_of,
+    warning_table,
 )
 
 
@@ -73,6 +74,31 @@ def test_what_anyone_could_say():
 )
 def test_bounds_of_a_share(inside, n, low, high):
     assert share_bounds(inside, n) == pytest.approx((low, high), abs=1e-7)
+
+
+def test_verdicts_are_judged_by_the_intervals_that_miss():
+    held, missed = ASKED[:2]
+
+    def judged(case: str, trust: str, *unknowns: Unknown) -> EstimateRecord:
+        return EstimateRecord(
+            case=case, status="converged", reason="", verdict=Verdict(trust), unknowns=unknowns
+        )
+
+    some = [
+        judged("a", TRUSTWORTHY, held, held),
+        judged("a", DOUBTFUL, missed, held),
+        judged("b", NONE, missed, ASKED[3]),
+        judged("b", TRUSTWORTHY, held, missed),
+    ]
+    (row,) = warning_table(some).rows
+    # Of the 3 x 4 pairs, the doubtful miss is worse than three and equal to one, the denied one
+    # worse than all four, and the trusted one equal to three.
+    assert (row["intervals"], row["missed"]) == (7, 3)
+    assert row["area"] == pytest.approx((3 + 0.5 + 4 + 1.5) / 12)
+    # Case a alone gives 5/6, case b alone 3/4.
+    assert (row["low"], row["high"]) == pytest.approx((0.75, 5 / 6))
+    (row,) = warning_table([some[0]]).rows
+    assert (row["intervals"], row["missed"], row["area"]) == (2, 0, None)
 
 
 def test_what_the_verdict_denies_has_no_numbers():

@@ -42,6 +42,7 @@ from mvest.reporting.skill import (
     stated,
     trust_of,
     verdict_table,
+    warning_table,
 )
 from mvest.reporting.tables import Column, Table, table
 from mvest.simulation.virtual_patient import PatientSettings
@@ -177,6 +178,7 @@ def summary(results: Results) -> dict[str, Table]:
             "": _with_nees(scenarios.skill("scenario", stated=False), patients),
             "trusted": skill_table("scenario", trusted.unknowns()),
             "verdicts": verdict_table(estimates),
+            "warning": warning_table(estimates),
             "moduli": skill_table("scenario, modulus", moduli),
             "estimates": _estimates(patients),
         }
