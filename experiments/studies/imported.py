@@ -129,6 +129,21 @@ class Settings:
     heart: HeartSettings = field(default_factory=HeartSettings)
 
 
+def require_data(values: Values) -> None:
+    """Raise an `InputError` if the recording, or a file of the heart, is missing."""
+    settings = STUDY.settings_of(values)
+    if settings.donor.case:
+        recording_folder(settings.donor.recording, settings.donor.case)
+    else:
+        _require_files(settings.heart)
+
+
+def _require_files(heart: HeartSettings) -> None:
+    for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
+        if file is None or not Path(file).is_file():
+            raise InputError(f"heart: no file {file}; {WHERE_FROM}/reference_heart.yaml")
+
+
 def run(job: Job[Settings]) -> Result:
     """Fit the recorded donor valve, or close, gate and estimate the reference heart.
 
@@ -279,9 +294,7 @@ def import_heart(heart: HeartSettings) -> ValveCase:
     InputError or GeometryError if a part is missing, or does not fit a thick valve with two
     muscles.
     """
-    for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
-        if file is None or not Path(file).is_file():
-            raise InputError(f"heart: no file {file}; {WHERE_FROM}/reference_heart.yaml")
+    _require_files(heart)
     known = LeafletsOptions(
         leaflets=heart.leaflets,
         units=heart.units,
@@ -370,5 +383,6 @@ STUDY = Study(
     figure=figure,
     captions={"": "A valve from outside and closures of its model."},
     keeps_failures=True,
+    require=require_data,
     golden=("case",),
 )

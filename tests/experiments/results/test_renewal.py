@@ -115,6 +115,14 @@ def test_a_failed_job_is_named_and_tried_again(mvest):
     assert found("sweep_truths") == (4, 0, 0, "")
 
 
+def test_a_study_without_its_data_publishes_nothing(mvest, monkeypatch):
+    monkeypatch.setenv("MVEST_TRIVALVE", "nowhere")
+    status, said = mvest("donor_diseased", "--run")
+    assert status == 1
+    assert "failed: donor_diseased: donor.recording = nowhere: there is no folder" in said
+    assert (runs(), RESULTS.exists()) == (0, False)
+
+
 def test_shards_end_in_one_sweep(mvest):
     counts = []
     for k in (1, 2):
