@@ -48,6 +48,10 @@ at most one more iteration."""
 DERIVATIVES = 1e-11
 """Estimated relative error of derivatives."""
 
+STALLED = 5
+"""Line searches in a row without sufficient decrease that end Newton's method: of 39 solutions none
+needed more than two, and a method that is stuck would go on to its last iteration."""
+
 SETTLINGS = 2
 """Largest number of rests before an equilibrium that is not found at once."""
 SETTLING_STEPS = 3
@@ -331,7 +335,7 @@ class _Stepper:
             self.solver.factorize(system.matrix(blocks, mass_factor), near=near)
 
         current = evaluate(x)
-        residuals = [float(np.linalg.norm(current.residual)) / current.scale]
+        residuals, stalled = [float(np.linalg.norm(current.residual)) / current.scale], 0
         for iteration in range(newton.max_iterations + 1):
             if not np.isfinite(residuals[-1]):
                 raise _StepError(StepReason.NO_CONVERGENCE)
@@ -359,8 +363,9 @@ class _Stepper:
                 # The last correction makes the state independent of its start within tolerance.
                 return _Solved(x + d if size <= HARMLESS else x, current, residuals, pairs)
             before = x, current.solid
-            x, current = self._line_search(x, d, current, pairs, evaluate)
-            if float(np.abs(x - state.x).max()) > self._far:
+            x, current, lower = self._line_search(x, d, current, pairs, evaluate)
+            stalled = 0 if lower else stalled + 1
+            if stalled == STALLED or float(np.abs(x - state.x).max()) > self._far:
                 raise _StepError(StepReason.NO_CONVERGENCE)
             residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
             if newton.single_solve:
@@ -385,15 +390,18 @@ class _Stepper:
         current: Evaluation,
         pairs: ContactPairs | None,
         evaluate: Callable[[FloatArray], Evaluation],
-    ) -> tuple[FloatArray, Evaluation]:
-        """Step along ``d``, admissible for contact, with backtracking on the slope r . d."""
+    ) -> tuple[FloatArray, Evaluation, bool]:
+        """Step along ``d``, admissible for contact, with backtracking on the slope r . d.
+
+        Also whether residual or slope decreased enough.
+        """
         contact = self.system.contact
         factor = min(1.0, self.newton.largest_move / max(float(np.abs(d).max()), 1e-300))
         if contact is not None and pairs is not None:
             y, dy = contact.points(x), contact.points(d)
             factor *= _largest_step(contact, pairs, y, factor * dy, detect=self._detect)
         if self.newton.single_solve:
-            return x + factor * d, evaluate(x + factor * d)
+            return x + factor * d, evaluate(x + factor * d), True
         norm = float(np.linalg.norm(current.residual))
         slope = abs(float(np.sum(current.residual * d)))
         best: tuple[float, FloatArray, Evaluation] | None = None
@@ -404,13 +412,13 @@ class _Stepper:
             new_slope = abs(float(np.sum(result.residual * d)))
             if np.isfinite(new_norm):
                 if new_norm <= (1 - 1e-3 * factor) * norm or new_slope <= 0.9 * slope:
-                    return trial, result
+                    return trial, result, True
                 if best is None or new_slope < best[0]:
                     best = (new_slope, trial, result)
             factor *= 0.5
         if best is None:
             raise _StepError(StepReason.NO_CONVERGENCE)
-        return best[1:]
+        return *best[1:], False
 
     def _differentiate(self, old: _State, new: _State, solved: _Solved, stride: _Stride) -> None:
         """Fill the derivatives of ``new``; the solver holds the factor of the converged tangent."""

@@ -256,8 +256,9 @@ def warning_table(estimates: Sequence[EstimateRecord]) -> Table:
         picks = np.random.default_rng(SEED).integers(len(cases), size=(SAMPLES, len(cases)))
         low, high = np.nanpercentile([area(chosen) for chosen in picks], (2.5, 97.5))
         found = area(range(len(cases)))
-    row = {"intervals": n, "missed": missed, "area": found, "low": low, "high": high}
-    about = {"intervals": Column(), "missed": Column()}
+    row = {"of": "moduli", "intervals": n, "missed": missed}
+    row |= {"area": found, "low": low, "high": high}
+    about = {"of": Column(), "intervals": Column(), "missed": Column()}
     about["area"] = Column(digits=".2f", low="low", high="high", label="area under the curve")
     return table([row], **about | dict.fromkeys(("low", "high"), Column(hidden=True)))
 

@@ -214,6 +214,23 @@ def test_iterates_that_run_away_and_detection_without_memory_fail_the_step(monke
     assert sheet(newton=halving).reason is StepReason.NO_CONVERGENCE
 
 
+def test_a_step_that_is_stuck_fails_soon(monkeypatch):
+    # Wherever the body moves, the residual stays as it was: no trial is better than the start.
+    true_evaluate, first = System.evaluate, []
+
+    def evaluate(self, *args, **options):
+        found = true_evaluate(self, *args, **options)
+        first.append(found.residual.copy())
+        found.residual[:] = first[0]
+        return found
+
+    monkeypatch.setattr(System, "evaluate", evaluate)
+    result = sheet(newton=NewtonSettings(max_halvings=0), times=[0.02])
+    assert result.reason is StepReason.NO_CONVERGENCE
+    # Five searches of eight trials, not sixty.
+    assert len(first) == 1 + 5 * 8
+
+
 def bent_and_thickened(mesh, curvature=0.6, thickness=2.0):
     """Positions of a block of side 2 and thickness 1, bent to a curvature (1/mm) and thickened."""
     turn, z = curvature * (mesh.nodes[:, 0] - 1.0), thickness * (mesh.nodes[:, 2] - 0.5)
