@@ -1,12 +1,8 @@
 """What each check of an estimate admits and what it refuses."""
 
 import math
-import re
 
-import numpy as np
-import pandas as pd
 import pytest
-from scipy.stats import rankdata
 
 from mvest.problem.verdict import (
     CHECKS,
@@ -15,11 +11,9 @@ from mvest.problem.verdict import (
     NONE,
     ONE_STATE,
     TRUSTWORTHY,
-    Found,
     judge,
     texts,
 )
-from tests.places import ROOT
 
 ALWAYS = dict.fromkeys(
     ("failed", "unfinished", "mistakes", "implausible", "unlike", "unaccounted"), ()
@@ -142,68 +136,3 @@ def test_two_doubtful_checks_are_none_and_two_findings_of_one_are_doubtful():
     assert judge(GOOD | smooth).trust == DOUBTFUL
     assert judge(GOOD | smooth | {"moved": one(1.0)}).trust == NONE
     assert judge(GOOD | {"implausible": texts("thick", "wide")}).trust == DOUBTFUL
-
-
-FILE = ROOT / "results" / "calibration_estimates.csv"
-LEVELS = (TRUSTWORTHY, DOUBTFUL, NONE)
-OLD = ("distance", "what the data add")
-"""Checks that no longer exist."""
-LEFT_OUT = "is not in the intervals: "
-
-
-def diagnostics(failed_checks: str) -> dict[str, Found]:
-    """Findings from the published failed checks of an estimate."""
-    names = "|".join(map(re.escape, (*{check.name for check in CHECKS.values()}, *OLD)))
-    found: dict[str, list[str]] = {}
-    for part in re.split(rf"; (?=(?:{names}): )", failed_checks) if failed_checks else []:
-        check, _, text = part.partition(": ")
-        found.setdefault(check, []).append(text)
-    case = found.get("case", [])
-    seen: dict[str, Found] = {
-        "failed": (),
-        "unfinished": texts(*found.get("iterations", [])),
-        "approximation": texts(*found.get("approximation", [])),
-        "mistakes": (),
-        "unlike": (),
-        "implausible": texts(*(text for text in case if LEFT_OUT not in text)),
-        "unaccounted": texts(*(text for text in case if LEFT_OUT in text)),
-        "innovation": (),
-        "stretch": [(3.0, {"what": "prior"})] if "what was known beforehand" in found else (),
-    }
-    for key, pattern in (
-        ("law", r"at (-?[\d.]+) of the way"),
-        ("moved", r"a modulus is ([\d.]+) of its"),
-    ):
-        if (check := CHECKS[key].name) in found:
-            seen[key] = [(float(re.search(pattern, found[check][0]).group(1)), {})]
-    return seen
-
-
-@pytest.fixture(scope="module")
-def judged():
-    """Seed, verdict, error of the logarithm and whether the interval missed, of each modulus."""
-    table = pd.read_csv(FILE, comment="#")
-    table = table[table["estimate"].notna()]
-    failed_checks = table["failed_checks"].fillna("")
-    verdicts = {text: judge(diagnostics(text)).trust for text in failed_checks.unique()}
-    return pd.DataFrame(
-        {
-            "seed": table["seed"],
-            "level": failed_checks.map(verdicts).map(LEVELS.index),
-            "error": np.abs(np.log(table["estimate"] / table["truth"])),
-            "missed": ~table["inside"].astype(bool),
-        }
-    )
-
-
-def test_the_levels_order_estimates_whose_seeds_chose_nothing(judged):
-    odd = judged[judged["seed"] % 2 == 1]
-    levels = [own for _, own in odd.groupby("level")]
-    # Moduli, missed intervals and median error of each level, as docs/own_valve.md states them.
-    assert [len(own) for own in levels] == [164, 70, 64]
-    assert [own["missed"].sum() for own in levels] == [1, 2, 13]
-    assert [own["error"].median() for own in levels] == pytest.approx([0.11, 0.13, 0.2], abs=0.005)
-    rank, missed = rankdata(odd["level"]), odd["missed"].to_numpy()
-    n = missed.sum()
-    area = (rank[missed].sum() - n * (n + 1) / 2) / (n * (len(odd) - n))
-    assert area == pytest.approx(0.844, abs=0.001)
