@@ -49,8 +49,8 @@ DERIVATIVES = 1e-11
 """Estimated relative error of derivatives."""
 
 STALLED = 5
-"""Line searches in a row without sufficient decrease that end Newton's method: of 39 solutions none
-needed more than two, and a method that is stuck would go on to its last iteration."""
+"""Line searches in a row without sufficient decrease that end Newton's method, which would be stuck
+until its last iteration. In the 39 solutions of one closure there were two in a row at most."""
 
 SETTLINGS = 2
 """Largest number of rests before an equilibrium that is not found at once."""
