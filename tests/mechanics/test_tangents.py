@@ -10,6 +10,7 @@ import pytest
 
 from mvest.mechanics.assembly import SparsityPattern, add_forces, adjacency
 from mvest.mechanics.body import outer_faces
+from mvest.mechanics.forces.contact import BARRIER
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.solid import Solid
@@ -19,10 +20,10 @@ from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, SIDE, block, sandwi
 STEPS = (2e-3, 1e-3, 1e-5)
 
 
-def check(residual, tangent_times_direction, x, direction, final=1e-7):
+def check(residual, tangent_times_direction, x, direction, final=1e-7, steps=STEPS):
     """Central differences along `direction` (mm, largest entry 1) approach the tangent as h^2."""
     errors = []
-    for h in STEPS:
+    for h in steps:
         difference = (residual(x + h * direction) - residual(x - h * direction)) / (2 * h)
         size = np.linalg.norm(tangent_times_direction)
         errors.append(np.linalg.norm(difference - tangent_times_direction) / size)
@@ -39,7 +40,7 @@ def directions(shape, seed=5):
     return d / np.abs(d).max()
 
 
-def check_system(system, x, loads, *, previous=None, rate=0.0, pairs=None, final=1e-7):
+def check_system(system, x, loads, *, previous=None, rate=0.0, pairs=None, final=1e-7, steps=STEPS):
     solid = system.solid
     previous = solid.initial_strain() if previous is None else previous
 
@@ -49,7 +50,7 @@ def check_system(system, x, loads, *, previous=None, rate=0.0, pairs=None, final
     blocks = system.evaluate(x, loads, pairs, previous, rate, tangent=True).blocks
     matrix = system.pattern.matrix(blocks)
     d = directions(x.shape)
-    check(residual, matrix @ d.ravel(), x, d, final)
+    check(residual, matrix @ d.ravel(), x, d, final, steps)
     return matrix.tobsr()
 
 
@@ -105,12 +106,12 @@ def test_follower_load_pushes_against_the_normal_and_sums_to_pressure_times_area
     np.testing.assert_allclose(force, [0, 0, -12.0], atol=1e-12)
 
 
-def pressed(system, loading, seed=3):
+def pressed(system, loading, seed=3, depth=0.7):
     """Positions in which the two sheets are bulged into contact, and the candidate pairs."""
     nodes = system.solid.mesh.nodes
     bulge = np.sin(np.pi * nodes[:, 0] / SIDE) * np.sin(np.pi * nodes[:, 1] / SIDE)
     x = nodes.copy()
-    x[:, 2] += np.where(nodes[:, 2] < 1.5, 0.7, -0.75) * bulge
+    x[:, 2] += np.where(nodes[:, 2] < 1.5, depth, -0.05 - depth) * bulge
     x += 0.02 * np.random.default_rng(seed).uniform(-1, 1, x.shape)
     pairs = system.search_contact(x)
     if pairs is not None:
@@ -125,6 +126,19 @@ def test_contact():
     x, pairs = pressed(alone, loading)
     matrix = check_system(alone, x, Loads(), pairs=pairs)
     assert abs(matrix - matrix.T).max() < 1e-12 * abs(matrix).max()
+
+
+def test_contact_beyond_the_barrier():
+    # With a constant force there, but the tangent of the barrier, Newton's method could not leave.
+    system, loading = sandwich()
+    law = BiotLaw(np.zeros((2, 6, 6)))
+    alone = System(Solid(system.solid.mesh, law, enhanced=False), contact=system.contact)
+    x, pairs = pressed(alone, loading, depth=0.9)
+    y = alone.contact.points(x)
+    distance = np.linalg.norm(y[pairs.first] - y[pairs.second], axis=1)
+    assert np.sum(distance < BARRIER * pairs.reference) > 10
+    # Short steps: at the barrier the force changes its slope within a micrometre.
+    check_system(alone, x, Loads(), pairs=pairs, steps=(1e-6, 5e-7, 1e-7))
 
 
 def test_contact_between_neighbours():

@@ -52,6 +52,10 @@ from mvest.valve.mesh.solid_mesh import Embedding
 
 BARRIER = 0.85
 """Distance of the barrier over the reference distance."""
+NEAREST = 1e-3
+"""Distance to the barrier, over the reference distance, below which the force grows linearly. No
+converged state is nearer. A start may be beyond the barrier, as a closed valve from another mesh;
+Newton's method then leads it out."""
 APPROACH = 0.75
 """Largest share of its distance to the barrier that a pair may lose in one Newton step."""
 
@@ -191,7 +195,8 @@ class Contact:
 def _kernel(r: float, h: float, r0: float, p0: float) -> tuple[float, float]:
     """First and second derivative of phi at ``r < h``."""
     rb = BARRIER * r0
-    r = max(r, rb + 1e-3 * r0)
+    beyond = min(r - rb - NEAREST * r0, 0.0)
+    r -= beyond
     s = (h - r) / (h - r0)
     u = (r0 - rb) / (r - rb)
     p = p0 * s**4 * u * u
@@ -201,7 +206,7 @@ def _kernel(r: float, h: float, r0: float, p0: float) -> tuple[float, float]:
     ddp = p * (slope * slope - 4.0 / (h - r) ** 2 + 2.0 / (r - rb) ** 2)
     first = (dp - p / r) / (2.0 * np.pi * r)
     second = (ddp - 2.0 * dp / r + 2.0 * p / (r * r)) / (2.0 * np.pi * r)
-    return first, second
+    return first + beyond * second, second
 
 
 @nb.njit(cache=True, inline="always")
