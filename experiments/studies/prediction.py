@@ -190,13 +190,15 @@ def _patient(
     predicted = []
     for scenario in settings.scenarios.values():
         model = model_under(usual, scenario)
-        check = None if finer is None else replace(model.fresh(), mesh=finer, guide=None)
+        # From the open valve, closures with a clip fail on these finer meshes: `model` guides them.
+        check = None if finer is None else replace(model.fresh(), mesh=finer, guide=model)
         found = predict_scenario(model, result.filtered, samples, lambda _: step(), finer=check)
         predicted.append((scenario, model, found))
         step()
     compared = {}
     for scenario, model, found in predicted:
         own = model_under(replace(twin.truth_model, valve=usual.valve), scenario)
+        own.guide = model
         compared[scenario.title] = found, closed_valve(own, truth)[0], closed_valve(model, truth)[0]
         step()
     return result, compared
