@@ -86,6 +86,19 @@ def test_every_committed_record_is_as_it_was_written() -> None:
         assert all(record.table == table for record in found.records.values())
 
 
+def test_the_tables_of_a_page_are_of_the_same_runs() -> None:
+    # A table that its study no longer writes would stay as it was.
+    pages: dict[str, set[str]] = {
+        path.stem: set() for path in (ROOT / "results" / "records").glob("*.jsonl")
+    }
+    for path in (ROOT / "results").glob("*.csv"):
+        of = [page for page in pages if f"{path.stem}_".startswith(f"{page}_")]
+        if of:
+            first, _, _ = path.read_text(encoding="utf-8").partition("\n")
+            pages[max(of, key=len)].add(first)
+    assert {page: first for page, first in pages.items() if len(first) != 1} == {}
+
+
 def small() -> Sweep:
     jobs = [job({"filter": name}, [run(1, TRUTH * 1.02, [0.1, 0.1])]) for name in ("ekf", "iekf")]
     return sweep("filter", [*jobs, job({"filter": "lost"}, [], "killed (signal 9)")])
