@@ -50,7 +50,8 @@ class Mode:
 MODES = (
     Mode("known geometry", "population"),
     Mode("volume", "volumes"),
-    Mode("surfaces", "surfaces", lambda one: one.numbers["kind"] in ("surfaces", "slicerheart")),
+    Mode("surfaces", "surfaces", lambda one: one.numbers["kind"] == "surfaces"),
+    Mode("SlicerHeart", "surfaces", lambda one: one.numbers["kind"] == "slicerheart"),
     Mode("label maps", "surfaces", lambda one: one.numbers["kind"] == "labels"),
     Mode("wrong assumptions", "calibration", lambda one: one.numbers["scenario"] != REFERENCE),
     Mode("five patients", "patients"),
@@ -138,6 +139,7 @@ def _row(mode: str, runs: Sequence[tuple[Record, EstimateRecord]]) -> dict[str, 
     seconds = [one.seconds or run.numbers.get("cpu_s") or run.seconds_total for run, one in runs]
     guess, median = every[GENERIC], every["median error"]
     judged = good.get("n", 0) >= FEWEST
+    widths = [width for own in moduli if np.isfinite(width := log_width(own))]
     lost = sum(not one.is_stated for one in estimates)
     ratios = [_ratio_errors(one) for one in estimates if one.is_stated]
     error, guessed = np.median(ratios, axis=0) if ratios else (None, None)
@@ -156,7 +158,7 @@ def _row(mode: str, runs: Sequence[tuple[Record, EstimateRecord]]) -> dict[str, 
         "judged square": good["mean square"] if judged else None,
         "intervals": good.get("n", 0),
         "inside": good.get("inside", 0),
-        "factor": float(np.exp(np.nanmedian([log_width(own) for own in moduli]) / 2)),
+        "factor": float(np.exp(np.median(widths) / 2)) if widths else None,
         "trusted": 100.0 * len(trusted) / len(estimates) if _is_judged(estimates) else None,
         "without": lost,
         "lost": lost / len(estimates),
