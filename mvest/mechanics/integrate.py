@@ -50,7 +50,7 @@ DERIVATIVES = 1e-11
 
 STALLED = 5
 """Line searches in a row without sufficient decrease that end Newton's method, which would be stuck
-until its last iteration. In the 39 solutions of one closure there were two in a row at most."""
+until its last iteration. Golden runs are the same without this limit."""
 
 SETTLINGS = 2
 """Largest number of rests before an equilibrium that is not found at once."""
