@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,9 +28,13 @@ from mvest.errors import GeometryError, InputError
 from mvest.reading.text import indices, numbers, one_line, read_columns, write_columns
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
-from mvest.valve.anatomy.template import Template, laid_out, smoothstep
-from mvest.valve.anatomy.valve import Chordae, LeafletSurface
-from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
+from mvest.valve.anatomy.template import Template, laid_out, vertex_region
+from mvest.valve.anatomy.valve import Chordae, LeafletSurface, vertex_normals
+from mvest.valve.geometry.surface_coordinates import (
+    SurfaceCoordinates,
+    surface_coordinates,
+    wrapped,
+)
 
 CHORD_COLUMNS = ("tip", "x", "y", "z", "family", "rest_length_mm", "stiffness_n")
 BRANCH_COLUMNS = ("start", "end")
@@ -78,41 +83,38 @@ def _thickness(
         return MM_PER[folder.document.units.length] * point_data(seen, given.point_data, 1)[:, 0]
     if isinstance(given, float):
         return np.full(len(seen.vertices), given)
-    by_name: Mapping[str, float] = GENERIC_THICKNESS if given is None else given
-    thinning = TemplateParameters().leaflets.edge_thinning
-    missing = [name for name in names if name not in by_name]
-    if missing:
-        raise InputError(
-            f"none for the region {', '.join(missing)}; give one in mm, or name the regions "
-            "anterior and posterior (not Anterior, AML or PML)"
-        )
-    unknown = [name for name in by_name if name not in names]
     if given is None:
-        listed = ", ".join(f"{by_name[name]:g} mm ({name})" for name in names)
-        folder.derived.append(f"thickness: {listed} assumed")
-        folder.derived.append(
-            f"thickness: falls towards the free edge as in the template, to {thinning:.0%}"
-        )
-    elif unknown:
+        if missing := [name for name in names if name not in GENERIC_THICKNESS]:
+            raise InputError(
+                f"none for the region {', '.join(missing)}; give one in mm, or name the regions "
+                "anterior and posterior (not Anterior, AML or PML)"
+            )
+        listed = ", ".join(f"{GENERIC_THICKNESS[name]:g} mm ({name})" for name in names)
+        folder.derived.append(f"thickness: {listed} assumed next to the annulus, and thinner edges")
+        return _band_of(reference, names).thickness
+    if missing := [name for name in names if name not in given]:
+        raise InputError(f"none for the region {', '.join(missing)}; give one in mm")
+    if unknown := [name for name in given if name not in names]:
         raise InputError(f"unknown region {unknown[0]!r}; known are {', '.join(names)}")
-    thickness = np.array([by_name[name] for name in names])[vertex_region]
-    if given is not None:
-        return thickness
-    # Thinner at the free edge, as in the template: otherwise leaflets do not close tightly.
-    loops = reference.annulus, reference.free_edge
-    s = surface_coordinates(seen.vertices, seen.triangles, *loops).s
-    return thickness * (1.0 - (1.0 - thinning) * smoothstep((s - 0.5) / 0.5))
+    return np.array([given[name] for name in names])[vertex_region]
 
 
 def _fibre(folder: CaseFolder, reference: CheckedFrame) -> FloatArray:
-    seen = reference.seen
+    seen, names = reference.seen, folder.document.region_names
     if folder.document.fibre is not None:
         return point_data(seen, folder.document.fibre, 3)
-    folder.derived.append(
-        "fibre: circumferential, perpendicular to the gradient from annulus to free edge"
-    )
-    loops = reference.annulus, reference.free_edge
-    return surface_coordinates(seen.vertices, seen.triangles, *loops).circumferential
+    around = "fibre: circumferential, perpendicular to the gradient from annulus to free edge"
+    if sorted(names) != sorted(GENERIC_THICKNESS):
+        folder.derived.append(around)
+        loops = reference.annulus, reference.free_edge
+        return surface_coordinates(seen.vertices, seen.triangles, *loops).circumferential
+    folder.derived.append(f"{around}, turning to it in the anterior leaflet near the commissures")
+    return _band_of(reference, names).fibre
+
+
+def _band_of(frame: CheckedFrame, names: tuple[str, ...]) -> LeafletBand:
+    loops = frame.annulus, frame.free_edge
+    return LeafletBand.of(*frame.labelled, *loops, names.index("anterior"))
 
 
 def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
@@ -246,11 +248,7 @@ def _laid_out(
             f"two papillary tips (here: {', '.join(names)}; {len(seen.tips)} tips)"
         )
 
-    def coordinates(band: CheckedFrame) -> LeafletBand:
-        loops = band.annulus, band.free_edge
-        return LeafletBand.of(*band.labelled, *loops, names.index("anterior"))
-
-    opened = coordinates(reference)
+    opened = _band_of(reference, names)
     closed, band = next((p for p in placed if p[0].role is Role.CLOSED), placed[0])
     goal: LeafletBand | FloatArray
     layout = SEEN_ON_BAND
@@ -265,7 +263,7 @@ def _laid_out(
         how, goal = "the closed frame (through its vertices)", closed.vertices
     else:
         how = "the closed frame (through the same material coordinates in it)"
-        goal = coordinates(band)
+        goal = _band_of(band, names)
     chordae = lay_out_chordae(opened, seen.tips, goal, closed.papillary_tips, layout)
     folder.derived.append(
         f"chordae: {len(chordae.insertion)} leaflet ends laid out as in the template, those of a "
@@ -281,7 +279,7 @@ class Places(NamedTuple):
     locate: Callable[[FloatArray, FloatArray], tuple[IntArray, FloatArray]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class LeafletBand:
     """A two-leaflet surface with the template's coordinates."""
 
@@ -313,6 +311,32 @@ class LeafletBand:
         on_edge = _angle_table(vertices, of_edge, edge, coordinates.theta, anterior, backwards=True)
         on_edge[1] += 2 * np.pi * np.round((on_annulus[1, 0] - on_edge[1, 0]) / (2 * np.pi))
         return cls(vertices, coordinates, on_annulus, on_edge)
+
+    @cached_property
+    def phi(self) -> FloatArray:
+        """Phi ``(n,)`` of the vertices, degrees; linear in s between annulus and free edge."""
+        theta, s = self.coordinates.theta, self.coordinates.s
+        around, along = (
+            np.interp(angle[0] + np.mod(theta - angle[0], 2 * np.pi), angle, phi)
+            for phi, angle in (self.annulus_angle, self.edge_angle)
+        )
+        return np.asarray(np.mod(around + s * np.degrees(wrapped(np.radians(along - around))), 360))
+
+    @property
+    def thickness(self) -> FloatArray:
+        """The template's thickness ``(n,)`` mm."""
+        return Template(TemplateParameters()).thickness(self.phi, self.coordinates.s)
+
+    @property
+    def fibre(self) -> FloatArray:
+        """The template's fibre directions ``(n, 3)``; the triangles face the ventricle."""
+        around, normal = (
+            self.coordinates.circumferential,
+            vertex_normals(self.vertices, self.coordinates.triangles),
+        )
+        angle = Template(TemplateParameters()).fibre_angle(self.phi, vertex_region(self.phi))
+        down = np.cross(around, normal)
+        return np.asarray(np.cos(angle)[:, None] * around - np.sin(angle)[:, None] * down)
 
     def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Corners ``(k, 3)`` and weights ``(k, 3)`` of points at phi (degrees) and s."""

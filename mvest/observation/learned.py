@@ -87,38 +87,37 @@ def error_family(
         if points is None or points.shape != observation.positions.shape[1:]:
             raise InputError("errors of corresponding vertices need all vertices at rest")
         stds = np.sqrt(observation.variance)
-        stated, coordinates = float(stds[-1]), 3
+        stated = float(stds[-1])
         scale = np.ones(len(points)) if observation.scale is None else observation.scale
         parts = [
-            (frame, points[seen], scale[seen] * own / stds[-1], 0)
+            (frame, ROUGH, points[seen], scale[seen] * own / stds[-1], 3)
             for frame, seen, own in zip(observation.frames, observation.seen, stds, strict=True)
         ]
     else:
-        stated, coordinates = observation.std_mm, 1
-        parts = []
+        stated, parts = observation.std_mm, []
         for seen in observation.seen:
-            at, q = seen.apart(FAR * (length or beliefs.length_mm)), len(seen.points)
-            # A point's own error is part of its position; means of neighbours hardly contain it.
-            near = cKDTree(at).query(at, min(NEIGHBOURS, q))[1]
-            scale = np.ones(q) if seen.scale is None else seen.scale
-            parts.append((seen.frame, at[near].reshape(q, -1, 3).mean(1), scale, seen.size - q))
+            at, edge = map(_blurred, seen.apart(FAR * (length or beliefs.length_mm)))
+            scale = np.ones(len(at)) if seen.scale is None else seen.scale
+            parts += [(seen.frame, ROUGH, at, scale, 1)] * (len(at) > 0)
+            parts += [(seen.frame, CURVES, edge, np.ones(len(edge)), 2)] * (len(edge) > 0)
     smooth, far, rough = beliefs.parts(stated, length)
     spectrum = Spectrum(smooth, far, beliefs.deviation)
     quantities: dict[str, LogNormal] = {}
     blocks, bands = [], None
-    for frame, at, scale, curves in parts:
-        own = []
-        if len(at):
-            basis = smooth_basis(at, spectrum.reference_length)
-            own.append(NoiseBlock(ROUGH, scale, coordinates, basis))
-            quantities[ROUGH] = rough
-            bands = bands or spectrum.prior(at)
-        if curves:
-            own.append(NoiseBlock(CURVES, np.ones(curves)))
-            quantities[CURVES] = LogNormal(stated, beliefs.std_factor)
-        if own and frame != parts[-1][0]:
-            name = f"frame {frame}"
-            own = [replace(block, frame=name) for block in own]
-            quantities[name] = LogNormal(1.0, beliefs.frame_factor)
-        blocks += own
+    for frame, kind, at, scale, coordinates in parts:
+        block = NoiseBlock(kind, scale, coordinates, smooth_basis(at, spectrum.reference_length))
+        quantities[kind] = rough
+        bands = bands or spectrum.prior(at)
+        if frame != parts[-1][0]:
+            block = replace(block, frame=f"frame {frame}")
+            quantities[f"frame {frame}"] = LogNormal(1.0, beliefs.frame_factor)
+        blocks.append(block)
     return NoiseFamily(tuple(blocks), quantities, bands, beliefs.resolution_mm)
+
+
+def _blurred(points: FloatArray) -> FloatArray:
+    """Means over neighbours: a point's own error is part of its position, and hardly of these."""
+    if not len(points):
+        return points
+    near = cKDTree(points).query(points, min(NEIGHBOURS, len(points)))[1]
+    return np.asarray(points[near.reshape(len(points), -1)].mean(axis=1))

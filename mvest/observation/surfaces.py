@@ -101,13 +101,19 @@ class ObservedSurface:
         scale = None if self.scale is None else self.scale[keep]
         return replace(self, points=self.points[keep], region=self.region[keep], scale=scale)
 
-    def apart(self, distance: float) -> FloatArray:
-        """The points ``(q, 3)`` with leaflets moved ``distance`` mm apart.
+    def apart(self, distance: float) -> tuple[FloatArray, FloatArray]:
+        """Points ``(q, 3)`` and compared points of the free edge, by leaflet ``distance`` mm apart.
 
         Errors of different leaflets are independent, and so are errors of distant points.
         """
-        extent = float(np.ptp(self.points, axis=0).max())
-        return self.points + (self.region * (extent + distance))[:, None]
+        every = [self.points] if self.free_edge is None else [self.points, self.free_edge]
+        distance += float(np.ptp(np.concatenate(every), axis=0).max())
+        points = self.points + distance * self.region[:, None]
+        if self.free_edge is None:
+            return points, np.zeros((0, 3))
+        kept, region = self.compared, self.free_edge_region
+        edge = self.free_edge if region is None else self.free_edge + distance * region[:, None]
+        return points, edge[kept]
 
     @property
     def compared(self) -> BoolArray:
@@ -202,8 +208,8 @@ class SurfaceObservation:
     #: standard deviation of the points along the normal, and of each component of the points of the
     #: free edge
     std_mm: float
-    #: correlation length of the errors of the distances, see `SpatialCorrelation`, within a frame
-    #: and a leaflet; 0: independent. Errors of the free edge are independent.
+    #: correlation length of the errors of the distances, and of those of the free edge, within a
+    #: frame and a leaflet, see `SpatialCorrelation`; 0: independent
     correlation_length_mm: float = 0.0
     #: frames that the model predicts, in the order in which it stacks them
     predicted: tuple[str, ...] = FRAMES
@@ -308,14 +314,14 @@ class SurfaceObservation:
     def _noise(self) -> NoiseCovariance:
         parts, length = [], self.correlation_length_mm
         for seen in self.seen:
-            if q := len(seen.points):
-                noise = observation_noise(self.std_mm**2, q)
+            points, edge = seen.apart(1000.0 * length)
+            for at, scale, coordinates in ((points, seen.scale, 1), (edge, None, 2)):
+                if not len(at):
+                    continue
+                noise = observation_noise(self.std_mm**2, coordinates * len(at))
                 if length:
-                    apart = seen.apart(1000.0 * length)
-                    noise = SpatialCorrelation(apart, length).noise(self.std_mm**2, 1)
-                parts.append(noise if seen.scale is None else scaled_noise(noise, seen.scale))
-            if rest := seen.size - q:
-                parts.append(observation_noise(self.std_mm**2, rest))
+                    noise = SpatialCorrelation(at, length).noise(self.std_mm**2, coordinates)
+                parts.append(noise if scale is None else scaled_noise(noise, scale))
         return stacked_noise(parts)
 
 

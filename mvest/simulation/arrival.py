@@ -105,7 +105,7 @@ def _through_slicerheart(
     """Write the files of ValveBatchExport with -vls, -acc and -lc, and the papillary muscles.
 
     Frames are midsurfaces (LPS mm; antero-lateral tip first). The atrial side of a leaflet is half
-    its mean thickness away.
+    its thickness away.
     """
     import pandas as pd
 
@@ -118,9 +118,8 @@ def _through_slicerheart(
         ring, middle = frame.annulus, frame.annulus.mean(axis=0)
         about = {"Filename": SCENE, "Phase": phase, "FrameNumber": index, "Valve": "mitral"}
         for label, name in enumerate(surface.region_names):
-            thick = float(surface.thickness[surface.vertex_region == label].mean())
             stem = f"{SCENE}_mitral_frame_{index}_{phase}_atrial_mitral_{name}_leaflet"
-            _write_atrial_side(folder / f"{stem}.vtk", frame, label, thick)
+            _write_atrial_side(folder / f"{stem}.vtk", frame, label, surface.thickness)
         between = 0.5 * (ring + np.roll(ring, -1, axis=0))
         for point in np.stack([ring, between], axis=1).reshape(-1, 3):
             contour.append(about | _in_ras("AnnulusContour", "XYZ", point))
@@ -188,8 +187,8 @@ def _in_ras(name: str, axes: str, point: FloatArray) -> dict[str, str]:
     return {f"{name}{axis}": f"{value:.2f}" for axis, value in zip(axes, values, strict=True)}
 
 
-def _write_atrial_side(file: Path, frame: Frame, label: int, thickness_mm: float) -> None:
-    """Write one remeshed leaflet, half its thickness nearer to the atrium.
+def _write_atrial_side(file: Path, frame: Frame, label: int, thickness_mm: FloatArray) -> None:
+    """Write one remeshed leaflet, half its thickness ``(n,)`` nearer to the atrium.
 
     It is a binary legacy file with the header of 3D Slicer, which names its axes.
     """
@@ -202,7 +201,8 @@ def _write_atrial_side(file: Path, frame: Frame, label: int, thickness_mm: float
     normals = surface(frame.vertices, frame.triangles).compute_normals(
         cell_normals=False, split_vertices=False, consistent_normals=False
     )
-    points = frame.vertices - 0.5 * thickness_mm * np.asarray(normals.point_data["Normals"])
+    up = -np.asarray(normals.point_data["Normals"])
+    points = frame.vertices + 0.5 * thickness_mm[:, None] * up
     leaflet = surface(points, frame.triangles[frame.region == label]).clean()
     model = leaflet.subdivide(1, subfilter="linear").decimate_pro(0.4, preserve_topology=True)
     model.clear_data()

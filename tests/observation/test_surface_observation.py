@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from mvest.errors import InputError
 from mvest.estimation import (
@@ -170,6 +171,7 @@ def test_a_curve_is_compared_across_and_not_along() -> None:
 
 def test_errors_are_correlated_within_a_leaflet_and_a_frame_only() -> None:
     # Two leaflets at one place and in two frames: of the four blocks, only those on the diagonal.
+    # The curve is one, and each of its points has two independent components.
     vertices, triangles = grid(4, 4)
     both = np.concatenate([vertices, vertices])
     surface = surface_of(
@@ -189,12 +191,13 @@ def test_errors_are_correlated_within_a_leaflet_and_a_frame_only() -> None:
     noise = observation_noise(observation.R, n)
     W = noise.whiten(np.eye(n))
     R = np.linalg.inv(W.T @ W)
-    # C(d) = (1 + sqrt(3) d / l) exp(-sqrt(3) d / l), times 0.5^2; the curve is independent.
-    d = np.sqrt(3) / 4.0 * np.linalg.norm(points[:6, None] - points[:6], axis=2)
-    expected = 0.25 * np.eye(n)
-    for start in (0, 6, 36, 42):
-        block = slice(start, start + 6)
-        expected[block, block] = 0.25 * (1 + d) * np.exp(-d)
+
+    def matern(at):  # C(d) = (1 + sqrt(3) d / l) exp(-sqrt(3) d / l), times 0.5^2
+        d = np.sqrt(3) / 4.0 * np.linalg.norm(at[:, None] - at, axis=2)
+        return 0.25 * (1 + d) * np.exp(-d)
+
+    leaflet, curve = matern(points[:6]), np.kron(matern(vertices[rim(4, 4)]), np.eye(2))
+    expected = block_diag(*2 * [leaflet, leaflet, curve])
     np.testing.assert_allclose(R, expected, atol=1e-9)
     assert noise.log_determinant == pytest.approx(np.linalg.slogdet(expected)[1], rel=1e-9)
 

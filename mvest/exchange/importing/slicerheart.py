@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.band import find_loops
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import InputError
 from mvest.exchange.importing.chord_lines import MARGINAL_MM, beginnings, chordae_of_lines
 from mvest.exchange.importing.joining import EDGE_MM, Leaflet, commissures_on, joined, united
@@ -85,9 +84,11 @@ class SlicerheartOptions:
         check_options(self, {"tips": 6, "thickness_mm": 2}, {})
 
     @property
-    def thickness(self) -> tuple[float, ...]:
-        """Thickness (mm) of the anterior and posterior leaflets, stated or generic."""
-        return self.thickness_mm or tuple(GENERIC_THICKNESS[name] for name in REGIONS)
+    def offset_mm(self) -> tuple[float, float] | None:
+        """Shift of each leaflet towards the ventricle; None: half the assumed thickness."""
+        if self.midsurface or self.thickness_mm is None:
+            return (0.0, 0.0) if self.midsurface else None
+        return 0.5 * self.thickness_mm[0], 0.5 * self.thickness_mm[1]
 
 
 def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
@@ -114,10 +115,11 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
         document = {
             "name": "valve from SlicerHeart",  # names of files and scenes may identify patients
             "source": "SlicerHeart",
-            "thickness": dict(zip(REGIONS, map(float, options.thickness), strict=True)),
             **({} if std is None else {"observation": {"std_mm": std, **known}}),
             "derived": derived,
         }
+        if options.thickness_mm is not None:
+            document["thickness"] = dict(zip(REGIONS, options.thickness_mm, strict=True))
         return case_of_frames(frames, document, chordae, mirrored=options.mirrored)
 
 
@@ -156,17 +158,12 @@ def _frames(
     """The frames with joined leaflets, in time order."""
     frames: list[FoundFrame] = []
     pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
-    offset, seams = (0.0, 0.0), None
-    if options.thickness_mm is None:
-        derived.append(
-            "thickness: {} mm (anterior), {} mm (posterior) assumed; thickness_mm=[...] states it"
-            "".format(*options.thickness)
-        )
+    offset, seams = options.offset_mm, None
     if not options.midsurface:
-        offset = (options.thickness[0] / 2, options.thickness[1] / 2)
+        shift = "the assumed one" if offset is None else "{:g} and {:g} mm".format(*offset)
         derived.append(
-            "midsurface: the atrial surfaces moved to the ventricle by half the thickness "
-            f"({offset[0]:g} and {offset[1]:g} mm); edges that curl by over 30 degrees left out"
+            f"midsurface: the atrial surfaces moved to the ventricle by half the thickness ({shift}"
+            "); edges that curl by over 30 degrees left out"
         )
     for seen, role in chosen:
         label = seen.phase or ("closed" if role is Role.CLOSED else "open")

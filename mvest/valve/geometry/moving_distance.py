@@ -79,6 +79,9 @@ def smooth_distances(
 def across_curve(curve: FloatArray, std: float) -> FloatArray:
     """Two unit vectors ``(j, 3, 2)`` across an observed closed curve, at each of its points.
 
+    They turn with the curve only, the second along its axis as far as it can, so that errors of
+    neighbouring points have the same directions.
+
     The tangent runs from a point before to a point after, ``TANGENT_REACH`` standard deviations
     away but at most an eighth of the points. An error of the tangent makes one component too small
     by its cosine: information is lost, never invented.
@@ -87,8 +90,16 @@ def across_curve(curve: FloatArray, std: float) -> FloatArray:
         span = np.roll(curve, -reach, axis=0) - np.roll(curve, reach, axis=0)
         if np.median(np.linalg.norm(span, axis=1)) >= 2.0 * TANGENT_REACH * std:
             break
-    # The right singular vectors after the first are an orthonormal basis across it.
-    return np.linalg.svd(span[:, None, :])[2][:, 1:].swapaxes(1, 2)
+    axis = np.cross(curve, np.roll(curve, -1, axis=0)).sum(axis=0)
+    aside = np.cross(span, axis)
+    alone = np.linalg.norm(aside, axis=1) < 1e-6 * np.linalg.norm(span, axis=1) * np.linalg.norm(
+        axis
+    )
+    # Along the axis any direction is across.
+    aside[alone] = np.cross(span[alone], np.eye(3)[np.argmin(np.abs(axis))])
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    along = np.cross(aside, span) / np.linalg.norm(span, axis=1, keepdims=True)
+    return np.stack([aside, along], axis=2)
 
 
 def smooth_offsets(

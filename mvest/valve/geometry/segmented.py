@@ -10,8 +10,6 @@ from mvest.errors import GeometryError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.leaflet_fields import (
-    CLOSED_STEP_MM,
-    STEP_MM,
     fields_of_masks,
     thick_leaflets,
 )
@@ -59,8 +57,7 @@ def masks_midsurface(
         See `mvest.valve.geometry.midsurface.midsurface`.
     """
     spacing, direction, origin = grid
-    step = STEP_MM if seams is None else CLOSED_STEP_MM
-    fields, first = fields_of_masks(masks, spacing, blur, step)
+    fields, first = fields_of_masks(masks, spacing, blur)
     start = origin + direction @ (spacing * first)
 
     def local(points: FloatArray) -> FloatArray:
