@@ -30,6 +30,7 @@ from mvest.simulation.arrival import KINDS, ArrivalSettings, Arrived, arrive
 from mvest.simulation.virtual_patient import PatientSettings
 from mvest.typing import FloatArray
 from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.triangles import areas
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +60,9 @@ def run_surfaces(job: Job[Settings]) -> Result:
     for role, true in (("open", arrived.opened), ("closed", arrived.closed)):
         numbers[f"{role}_back_mm"] = surface_error(arrived.case.frame(true.role), true)
     numbers["thickness_mean_mm"] = thickness_error(arrived, patient.surface.thickness)
+    seen = [arrived.case.frame(true.role) for true in (arrived.opened, arrived.closed)]
+    off = area_strain(*seen) - area_strain(arrived.opened, arrived.closed)
+    numbers |= zip(STRAINS, off.tolist(), strict=True)
     # The imported case lacks the displacements of the patient's case.
     truth = {name: hidden["values"][name] for name in hidden["values"] if name.startswith("E_f.")}
     about = {"case": patient.name, "seed": job.values["seed"]}
@@ -70,6 +74,12 @@ def surface_error(found: Frame, true: Frame) -> float:
     """Root mean square distance (mm) from the true midsurface's vertices to another surface."""
     distance = closest_points(true.vertices, found.vertices, found.triangles).distance
     return float(np.sqrt(np.mean(np.square(distance))))
+
+
+def area_strain(opened: Frame, closed: Frame) -> FloatArray:
+    """Change (%) of the area of each leaflet ``(2,)`` from the open to the closed frame."""
+    size = [np.bincount(f.region, areas(f.vertices, f.triangles)) for f in (opened, closed)]
+    return np.asarray(100.0 * (size[1] / size[0] - 1.0))
 
 
 def thickness_error(arrived: Arrived, thickness_mm: FloatArray) -> float:
@@ -90,6 +100,7 @@ def summary(results: Results) -> dict[str, Table]:
                 "patient": estimate.case,
                 "geometry": record.numbers["geometry"],
                 **{name: record.numbers[f"{name}_mm"] for name in OFF},
+                **{name: record.numbers[name] for name in STRAINS},
                 **modulus_row(estimate, own),
                 "failed_checks": "; ".join(f"{one.check}: {one.text}" for one in failed_checks),
                 "ended": record.reason,
@@ -98,6 +109,7 @@ def summary(results: Results) -> dict[str, Table]:
         ]
     about = {"patient": Column(label="patient (simulated)"), "geometry": Column()}
     about |= dict.fromkeys(OFF, Column("mm", ".2f"))
+    about |= dict.fromkeys(STRAINS, Column("% points", ".1f"))
     hidden = dict.fromkeys(("failed_checks", "ended"), Column(hidden=True))
     return {
         "": table(rows, **about, **MODULUS_COLUMNS, **hidden),
@@ -107,6 +119,8 @@ def summary(results: Results) -> dict[str, Table]:
 
 OFF = ("open_back", "closed_back", "thickness_mean")
 """Geometric errors (mm), by their names in a record."""
+STRAINS = "anterior_area_strain_off", "posterior_area_strain_off"
+"""Errors of the change of area from open to closed, percentage points."""
 
 
 def _runs(results: Results) -> list[tuple[Record, EstimateRecord]]:
