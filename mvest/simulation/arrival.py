@@ -24,7 +24,9 @@ from mvest.problem.registration import displace
 from mvest.quantities import Length
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.thickening import smooth_vertex_normals
+from mvest.valve.geometry.triangles import unit_rows
 
 KINDS = ("vertices", "surfaces", "slicerheart", "labels")
 """Ways of exporting a geometry, in the order of tables."""
@@ -252,8 +254,13 @@ def drawn_leaflets(
     frame: Frame | LeafletSurface, thickness_mm: FloatArray
 ) -> tuple[NDArray[np.uint8], FloatArray]:
     """Labels on a fine grid, and the position of its first point (LPS mm)."""
-    vertices, triangles = frame.vertices, frame.triangles
-    corner, normals = vertices[triangles], smooth_vertex_normals(vertices, triangles)
+    vertices, triangles = frame.vertices.copy(), frame.triangles
+    normals = smooth_vertex_normals(vertices, triangles)
+    # Points are drawn as cells of the fine grid, which reach half a cell beyond them.
+    for loop in boundary_loops(triangles):
+        along = np.roll(vertices[loop], -1, axis=0) - np.roll(vertices[loop], 1, axis=0)
+        vertices[loop] += 0.5 * FINE_MM * unit_rows(np.cross(normals[loop], along))
+    corner = vertices[triangles]
     longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max()
     k = int(np.ceil(longest / (0.8 * FINE_MM)))
     i, j = np.meshgrid(np.arange(k + 1), np.arange(k + 1))
@@ -262,7 +269,6 @@ def drawn_leaflets(
     points = np.einsum("ka,tai->tki", weights, corner).reshape(-1, 3)
     along = np.einsum("ka,tai->tki", weights, normals[triangles]).reshape(-1, 3)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    # Points are drawn as cells of the fine grid, which reach half a cell beyond them.
     reach = np.einsum("ka,ta->tk", weights, thickness_mm[triangles]).ravel() - FINE_MM
     leaflet = np.repeat(frame.region + 1, len(weights)).astype(np.uint8)
     low = vertices.min(axis=0) - MARGIN_MM

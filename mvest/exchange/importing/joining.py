@@ -252,6 +252,11 @@ def joined(
         gaps.append(width)
     corners, labels = same[np.concatenate(faces)], np.concatenate(region)
     proper = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+    # A strip may lie back to back on a triangle of a leaflet; both are left out.
+    _, same_three, times = np.unique(
+        np.sort(corners, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    proper &= times[same_three.ravel()] == 1
     used, inverse = np.unique(corners[proper], return_inverse=True)
     triangles, _ = without_ears(inverse.reshape(-1, 3))
     middle = np.searchsorted(used, same[arcs[0][len(arcs[0]) // 2]])

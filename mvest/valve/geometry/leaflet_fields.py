@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
+from scipy.optimize import brentq
 from scipy.spatial import cKDTree
-from scipy.special import erf
+from scipy.special import ndtr, ndtri
 from skimage import measure
 
 from mvest.errors import GeometryError
@@ -44,6 +45,10 @@ LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4)
 ON_GRID = 0.02
 """Smallest distance of a grid point from the surface, in steps."""
 MAX_VOXELS = 4 * 10**7
+SEEN = 0.7
+"""Half thickness over the blur, below which no point has half a share of tissue (0.675)."""
+NEAR = 1.5
+"""Distance from a wall, in standard deviations of the blur, within which the share states it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +60,7 @@ class LeafletFields:
     distance: FloatArray
     union: FloatArray  #: (I, J, K) mm, to both leaflets together
     step: float  #: mm between grid points
-    blur_mm: float  #: standard deviation of the smoothing of the distances
+    blur_mm: float  #: standard deviation by which the share of tissue is blurred, normal
     voxel_mm: float  #: size of the original voxels, 0 for surfaces
 
     def label(self, points: FloatArray) -> IntArray:
@@ -69,17 +74,28 @@ class LeafletFields:
         return np.asarray((between < 0).astype(np.int64))
 
     def true_thickness(self, thickness: FloatArray) -> FloatArray:
-        """True thickness (mm) of tissue, given its thickness in the smoothed distances.
+        """True thickness (mm) of tissue, given that between the walls of the fields.
 
-        The distance ``a - |x|`` from the middle of a sheet of thickness 2 a, smoothed by a normal
-        distribution, is zero where the mean of ``|x + blur z|`` is a.
+        Of a sheet of thickness 2 a, ``F((a - x) / blur) + F((a + x) / blur) - 1`` with the normal
+        distribution F is the blurred share of tissue at x from its middle, half at the walls.
         """
-        if self.blur_mm == 0:
-            return thickness
-        x = 0.5 * thickness
-        ratio = x / (np.sqrt(2) * self.blur_mm)
-        mean = x * erf(ratio) + self.blur_mm * np.sqrt(2 / np.pi) * np.exp(-(ratio**2))
-        return np.asarray(2 * mean)
+        half = np.linspace(SEEN, 8.0, 200)
+
+        def off(wall: float, own: float) -> float:
+            return float(ndtr(own - wall) + ndtr(own + wall) - 1.5)
+
+        wall = np.array([brentq(off, 0.0, own + 1.0, args=(own,)) for own in half])
+        given = 0.5 * thickness / self.blur_mm
+        return 2 * self.blur_mm * np.where(given < wall[-1], np.interp(given, wall, half), given)
+
+    def lost_rim(self, thickness: FloatArray) -> FloatArray:
+        """How far (mm) the fields end short of a square rim, given the true thickness.
+
+        The middle of a sheet has the share ``2 F(a / blur) - 1`` of tissue, and as far from its end
+        as the fields' wall half of that is left.
+        """
+        half = np.maximum(0.5 * thickness / self.blur_mm, SEEN)
+        return np.asarray(self.blur_mm * ndtri(0.5 / (2.0 * ndtr(half) - 1.0)))
 
 
 class ThickLeaflets(NamedTuple):
@@ -133,21 +149,24 @@ def fields_of_masks(
     at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")) * step
     at /= spacing[:, None, None, None]
 
+    # Linear interpolation blurs as well.
+    blur_mm = voxel * float(np.hypot(blur, 6**-0.5))
+
     def distance(mask: BoolArray) -> FloatArray:
         part = np.zeros(high - low, dtype=np.bool_)
         inside = tuple(
             slice(b.start - start, b.stop - start) for b, start in zip(box, low, strict=True)
         )
         part[inside] = mask[box]
-        inner = ndimage.distance_transform_edt(part, sampling=spacing)
-        outer = ndimage.distance_transform_edt(~part, sampling=spacing)
-        # A voxel's wall is half a voxel nearer than the next centre.
-        signed = np.where(part, inner - 0.5 * voxel, 0.5 * voxel - outer)
-        fine = ndimage.map_coordinates(signed, at, order=1, mode="nearest")
-        return np.asarray(ndimage.gaussian_filter(fine, blur * voxel / step))
+        share = ndimage.map_coordinates(part.astype(np.float32), at, order=1)
+        share = ndimage.gaussian_filter(share, blur * voxel / step)
+        near = blur_mm * ndtri(np.clip(share, 1e-3, 1 - 1e-3))
+        inner, outer = (ndimage.distance_transform_edt(own) for own in (near > 0, near <= 0))
+        far = step * np.where(near > 0, inner - 0.5, 0.5 - outer)
+        return np.asarray(np.where(np.abs(near) < NEAR * blur_mm, near, far))
 
     fields = LeafletFields(
-        np.stack([distance(mask) for mask in masks]), distance(both), step, blur * voxel, voxel
+        np.stack([distance(mask) for mask in masks]), distance(both), step, blur_mm, voxel
     )
     return fields, low.astype(np.float64)
 

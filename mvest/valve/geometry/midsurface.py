@@ -80,6 +80,13 @@ class Midsurface:
 
         return replace(self, vertices=turned(self.vertices), thickness=turned(self.thickness))
 
+    def extended(self, by_mm: FloatArray) -> Midsurface:
+        """The surface with its two edges farther out by ``(2, columns)`` mm."""
+        grid = self.vertices.reshape(-1, len(self.annulus), 3).copy()
+        outwards = grid[[0, -1]] - grid[[1, -2]]
+        grid[[0, -1]] += by_mm[..., None] * outwards / np.linalg.norm(outwards, axis=2)[..., None]
+        return replace(self, vertices=grid.reshape(-1, 3))
+
     def smoothed(self, width_mm: float) -> tuple[Midsurface, float]:
         """Smooth the surface around the valve; also return the largest move (mm) of a vertex.
 

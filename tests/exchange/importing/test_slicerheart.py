@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from mvest.cases.case import Role
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.chord_lines import MARGINAL_MM
-from mvest.exchange.importing.joining import _flat_part
+from mvest.exchange.importing.joining import _curled
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.simulation.arrival import POSE, SHIFT, ArrivalSettings, arrive
 from mvest.valve.geometry.proximity import closest_points
@@ -88,10 +88,9 @@ def test_edges_that_curl_round_a_rim_are_cut_off():
     curve = np.stack([np.interp(even, along, axis) for axis in curve.T], axis=1)
     rows = np.zeros((81, 6, 3))
     rows[:, :, 2], rows[:, :, 0] = curve[:, :1], curve[:, 1:]
-    flat = _flat_part(rows, np.full(6, radius))
-    assert flat[[0, -1], 0, 2] == pytest.approx([0, -8], abs=0.02)
-    assert np.abs(flat[..., 0]).max() < 0.01
-    assert np.array_equal(_flat_part(rows[10:70], np.full(6, radius)), rows[10:70])
+    shares = _curled(rows, np.full((2, 6), radius))
+    assert shares * along[-1] == pytest.approx(np.full((2, 6), radius * np.pi / 2), abs=0.02)
+    assert not _curled(rows[10:70], np.full((2, 6), radius)).any()
 
 
 def test_the_annulus_alone_gives_the_commissures(folder, case):
