@@ -41,7 +41,7 @@ are correlated.
 
 GOLDEN = {
     "twin": "5f237e0fb427",
-    "case": "115ac1f42cc5",
+    "case": "7abb08eec146",
     "patient": "6f872d8bb3c6",
     "volume": "eeeb18e1daa5",
 }
