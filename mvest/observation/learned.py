@@ -96,7 +96,7 @@ def error_family(
     else:
         stated, parts = observation.std_mm, []
         for seen in observation.seen:
-            at, edge = map(_blurred, seen.apart(FAR * (length or beliefs.length_mm)))
+            at, edge = map(_averaged, seen.apart(FAR * (length or beliefs.length_mm)))
             scale = np.ones(len(at)) if seen.scale is None else seen.scale
             parts += [(seen.frame, ROUGH, at, scale, 1)] * (len(at) > 0)
             parts += [(seen.frame, CURVES, edge, np.ones(len(edge)), 2)] * (len(edge) > 0)
@@ -115,7 +115,7 @@ def error_family(
     return NoiseFamily(tuple(blocks), quantities, bands, beliefs.resolution_mm)
 
 
-def _blurred(points: FloatArray) -> FloatArray:
+def _averaged(points: FloatArray) -> FloatArray:
     """Means over neighbours: a point's own error is part of its position, and hardly of these."""
     if not len(points):
         return points

@@ -111,6 +111,23 @@ def test_a_filter_learns_the_errors_of_distances_and_of_curves() -> None:
         assert low < true < high, name
 
 
+def test_errors_of_a_curve_are_correlated_along_it_alone() -> None:
+    observation = surface_observation(np.zeros(N), np.zeros((4 * SIDE - 4, 3)))
+    R = covariance(error_family(observation, BELIEFS, 8.0))
+    q = len(observation.seen[0].points)
+    assert np.abs(R[:q, q:]).max() < 1e-12
+    curve = R[q:, q:].reshape(4 * SIDE - 4, 2, 4 * SIDE - 4, 2)
+    assert np.abs(curve[:, 0, :, 1]).max() < 1e-12
+    alike = curve[:, 0, :, 0] / np.sqrt(np.outer(*2 * [np.diag(curve[:, 0, :, 0])]))
+    # Neighbours are 1.5 mm apart, points of opposite sides 22 mm.
+    middle = SIDE // 2
+    assert alike[middle, middle + 1] > 0.8
+    assert abs(alike[middle, middle + 2 * SIDE]) < 0.3
+    # As large as stated, with a fifth of it in the rough part.
+    size = np.sqrt(np.trace(R[q:, q:]) / len(R[q:]))
+    assert size == pytest.approx(0.5 * np.hypot(1.0, BELIEFS.other_share), rel=0.2)
+
+
 BAD = (
     ("std_factor", 0.5), ("length_mm", 0.0), ("other_share", np.inf),
 )  # fmt: skip
