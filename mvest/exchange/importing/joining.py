@@ -24,7 +24,12 @@ from mvest.valve.anatomy.valve import BandGrid, band_grid
 from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.thickening import smooth_vertex_normals
-from mvest.valve.geometry.triangles import areas, connected_pieces, surface_edges
+from mvest.valve.geometry.triangles import (
+    areas,
+    connected_pieces,
+    directed_edges,
+    surface_edges,
+)
 
 COINCIDENT = 1e-6
 """Merge distance (mm) of the vertices of both leaflets."""
@@ -261,12 +266,33 @@ def joined(
     triangles, _ = without_ears(inverse.reshape(-1, 3))
     middle = np.searchsorted(used, same[arcs[0][len(arcs[0]) // 2]])
     loops = sorted(two_loops(vertices[used], triangles), key=lambda loop: middle not in loop)
-    band = LeafletBand.of(vertices[used], triangles, labels[proper], loops[0], loops[1], 0)
     around = 0.5 * sum(loop_length(vertices[used][loop]) for loop in loops)
-    along = areas(vertices[used], triangles).sum() / around
+    points, triangles, labels = _without_chords(vertices[used], triangles, labels[proper], loops)
+    band = LeafletBand.of(points, triangles, labels, loops[0], loops[1], 0)
+    along = areas(points, triangles).sum() / around
     columns = 4 * max(6, round(around / EDGE_MM / 4))
     grid = band_grid(columns, 1 + max(4, round(along / EDGE_MM)))
-    return _drawn(band, labels[proper], grid, columns, offset_mm), shares, max(gaps)
+    return _drawn(band, labels, grid, columns, offset_mm), shares, max(gaps)
+
+
+def _without_chords(
+    vertices: FloatArray, triangles: IntArray, region: IntArray, loops: Sequence[IntArray]
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Split the inner edges between two vertices of one loop, beyond which no coordinate varies."""
+    on = np.zeros(len(vertices), dtype=np.int64)
+    for number, loop in enumerate(loops, 1):
+        on[loop] = number
+    edges, times = np.unique(np.sort(directed_edges(triangles), axis=1), axis=0, return_counts=True)
+    a, b = edges.T
+    chords = edges[(times == 2) & (on[a] > 0) & (on[a] == on[b])]
+    points, faces, labels = [vertices], triangles, region
+    for k, (start, end) in enumerate(chords, len(vertices)):
+        points.append(0.5 * (vertices[start] + vertices[end])[None])
+        beside = (faces == start).any(axis=1) & (faces == end).any(axis=1)
+        halves = [np.where(faces[beside] == corner, k, faces[beside]) for corner in (start, end)]
+        faces = np.concatenate([faces[~beside], *halves])
+        labels = np.concatenate([labels[~beside], labels[beside], labels[beside]])
+    return np.concatenate(points), faces, labels
 
 
 def _facing_ventricle(

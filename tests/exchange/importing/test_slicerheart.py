@@ -11,11 +11,13 @@ from scipy.spatial import cKDTree
 from mvest.cases.case import Role
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.chord_lines import MARGINAL_MM
-from mvest.exchange.importing.joining import _curled
+from mvest.exchange.importing.joining import _curled, _without_chords
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.simulation.arrival import POSE, SHIFT, ArrivalSettings, arrive
+from mvest.valve.anatomy.valve import band_grid
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.triangles import areas
+from mvest.valve.geometry.surface_coordinates import surface_coordinates
+from mvest.valve.geometry.triangles import areas, directed_edges
 from tests.cases.folders import template_case, tree_case
 
 pyvista = pytest.importorskip("pyvista", reason="needs PyVista, which comes with the extra viz")
@@ -91,6 +93,27 @@ def test_edges_that_curl_round_a_rim_are_cut_off():
     shares = _curled(rows, np.full((2, 6), radius))
     assert shares * along[-1] == pytest.approx(np.full((2, 6), radius * np.pi / 2), abs=0.02)
     assert not _curled(rows[10:70], np.full((2, 6), radius)).any()
+
+
+def test_a_lobe_beyond_an_edge_between_two_vertices_of_the_rim_has_coordinates():
+    grid, lobe = band_grid(12, 4), np.arange(48, 51)
+    turn = np.radians(grid.phi)
+    tube = np.stack([10 * np.cos(turn), 10 * np.sin(turn), -6 * grid.s], axis=1)
+    # Two vertices of the free edge, two below them, and one in the middle of the four.
+    first, second = tube[36], tube[37]
+    below = np.stack([first, second]) - [0, 0, 3.0]
+    points = np.concatenate([tube, below, [np.mean([first, second, *below], axis=0)]])
+    added = [[36, 37, 50], [37, 49, 50], [49, 48, 50], [48, 36, 50]]
+    inwards = [36, 37] in directed_edges(grid.triangles).tolist()
+    triangles = np.concatenate([grid.triangles, np.array(added)[:, :: -1 if inwards else 1]])
+    loops = np.arange(12), np.r_[36, lobe[:2], np.arange(37, 48)]
+    with pytest.raises(GeometryError, match="fold over at 4 triangles"):
+        surface_coordinates(points, triangles, *loops)
+    more, faces, region = _without_chords(points, triangles, np.zeros(len(triangles)), loops)
+    found = surface_coordinates(more, faces, *loops)
+    assert found.s[50] < 1.0 - 1e-3
+    assert (len(more), len(faces), len(region)) == (52, len(triangles) + 2, len(triangles) + 2)
+    assert areas(more, faces).sum() == pytest.approx(areas(points, triangles).sum())
 
 
 def test_the_annulus_alone_gives_the_commissures(folder, case):
