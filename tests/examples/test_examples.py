@@ -27,7 +27,6 @@ def test_the_case_is_read_and_says_what_was_derived():
     assert [sentence.partition(":")[0] for sentence in case.derived] == [
         "annulus and free edge",
         "thickness",
-        "thickness",
         "fibre",
         "chordae",
     ]
