@@ -84,7 +84,8 @@ def _thickness(
     if isinstance(given, float):
         return np.full(len(seen.vertices), given)
     if given is None:
-        if missing := [name for name in names if name not in GENERIC_THICKNESS]:
+        if sorted(names) != sorted(GENERIC_THICKNESS):
+            missing = [name for name in names if name not in GENERIC_THICKNESS] or names
             raise InputError(
                 f"none for the region {', '.join(missing)}; give one in mm, or name the regions "
                 "anterior and posterior (not Anterior, AML or PML)"

@@ -27,8 +27,8 @@ from mvest.valve.geometry.triangles import connected_pieces, euler_number, surfa
 marching_cubes: Any = measure.marching_cubes
 MARGIN_MM = 3.0
 STEP_MM = 0.2
-"""Grid step (mm). The cut between leaflets must leave most of one of 1 mm intact, and a posterior
-leaflet loses 2 % of its area at 0.4 mm (0.2 % here, at most; true surface known, simulated)."""
+"""Grid step (mm). The cut between leaflets must leave most of a 1 mm leaflet intact, and a coarser
+grid cuts off the rims of thin ones."""
 CUT_STEPS = 2.0
 """Width of the cut between leaflets in contact, in grid steps. The cut is not refilled: smoothing
 removes as much from a free wall, so the midsurface does not move."""
