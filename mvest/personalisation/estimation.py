@@ -18,7 +18,7 @@ from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
-from mvest.estimation.estimate import Estimate, OnIterate
+from mvest.estimation.estimate import Estimate, OnIterate, Reason
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
@@ -306,7 +306,9 @@ def _relinearised(
             why = "; ".join(found.errors.unaccounted)
             break
         trial = _estimate_about(problem, found, final=False)
-        if not trial.converged:
+        # Out of iterations, it still leads on: a next point must be more probable than this one.
+        unfinished = trial.filtered is not None and trial.filtered.reason is Reason.MAX_ITERATIONS
+        if not (trial.converged or unfinished):
             why = f"{trial.reason} ({trial.detail})"
             break
         point, result = found, trial

@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 
 from mvest.cases.case import Role
 from mvest.errors import GeometryError
+from mvest.estimation.estimate import Reason
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import low_rank_noise, observation_noise
 from mvest.estimation.prediction import Prediction
@@ -270,6 +271,24 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_its_reaso
     (reason,) = failed.unaccounted
     assert reason.startswith("about the expected geometry: ")
     assert why in reason
+
+
+def test_relinearisation_goes_on_from_estimates_that_are_out_of_iterations(monkeypatch):
+    case, known = bent_case(monkeypatch, curve=1.0)
+    finished, about = renewed(case, known, 2), estimation._estimate_about
+
+    def out_of_iterations(problem, point, *, final=True):
+        found = about(problem, point, final=final)
+        if final:
+            return found
+        filtered = replace(found.filtered, reason=Reason.MAX_ITERATIONS)
+        return replace(found, filtered=filtered, converged=False)
+
+    monkeypatch.setattr(estimation, "_estimate_about", out_of_iterations)
+    fit = renewed(case, known, 2)
+    np.testing.assert_array_equal(fit.result.estimate, finished.result.estimate)
+    assert fit.unaccounted == ()
+    assert fit.moved == finished.moved is not None
 
 
 def test_other_unaccounted_errors_do_not_stop_relinearisation(monkeypatch):
