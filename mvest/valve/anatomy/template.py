@@ -258,7 +258,10 @@ class Template:
         return np.cos(angle)[..., None] * t + np.sin(angle)[..., None] * across
 
     def fibre_angle(self, phi: FloatArray, region: IntArray) -> FloatArray:
-        """Angle ``(k,)`` in rad of the fibres to the direction around the valve."""
+        """Angle ``(k,)`` in rad of the fibres to the direction around the valve.
+
+        It turns the same way round at both commissures (`docs/decisions.md`).
+        """
         turn = self.parameters.leaflets.fibre_turn * 180.0
         from_commissure = np.minimum(np.mod(phi, 360.0), np.abs(180.0 - np.mod(phi, 360.0)))
         angle = 0.5 * np.pi * (1 - smoothstep(from_commissure / turn))
