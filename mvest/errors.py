@@ -6,6 +6,7 @@ computation that does not converge raises nothing; the `reason` of its result sa
 
 import errno
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -19,6 +20,14 @@ class InputError(MvestError):
 
 class GeometryError(InputError):
     """A surface, a mesh or a valve is inadmissible: inverted, open, non-manifold, disconnected."""
+
+
+class CrossingError(GeometryError):
+    """Triangles of a surface pass through each other."""
+
+    def __init__(self, message: str, vertices: Sequence[int] = ()) -> None:
+        super().__init__(message)
+        self.vertices = vertices  #: numbers of some of their corners
 
 
 class MaterialError(InputError):

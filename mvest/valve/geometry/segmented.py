@@ -5,8 +5,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from mvest.errors import GeometryError
+from mvest.errors import CrossingError, GeometryError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.leaflet_fields import (
@@ -19,8 +20,9 @@ from mvest.valve.geometry.thickening import thicken
 
 BEND_MM = 3.0
 """Bending radius of the leaflets at the commissures."""
-REPAIRS_MM = (0.0, 1.0, 2.0, 4.0)
-"""Additional smoothing lengths, tried in order if leaflets intersect themselves."""
+REPAIR_MM, REPAIRS = 1.0, 16
+"""Length over which leaflets are smoothed near places where they pass through themselves, which is
+also that of the neighbourhood, and largest number of times."""
 HEAD_MM = 5.0
 """Height of a muscle's head, from which its chordae arise."""
 MIN_SLENDER = 1.5
@@ -85,9 +87,9 @@ def masks_midsurface(
 def without_crossings(
     surface: Midsurface, smoothing_mm: float, *, thickened: bool
 ) -> tuple[Midsurface, str]:
-    """Smooth the surface around the valve, and smooth it further if it intersects itself.
+    """Smooth the surface around the valve, and smooth it further where it passes through itself.
 
-    GeometryError if the surface intersects itself at every level of smoothing.
+    CrossingError if it still does after `REPAIRS` rounds, GeometryError for other faults.
 
     Parameters
     ----------
@@ -95,7 +97,7 @@ def without_crossings(
     smoothing_mm
         See `mvest.valve.geometry.midsurface.Midsurface.smoothed`.
     thickened
-        Whether the thickened surface must not intersect itself either (for meshing).
+        Whether the thickened surface must not pass through itself either (for meshing).
 
     Returns
     -------
@@ -103,25 +105,38 @@ def without_crossings(
     str
         Description of the smoothing; empty if there was none.
     """
-    faults = []
-    for further in REPAIRS_MM:
-        smooth, moved = surface.smoothed(smoothing_mm + further)
+    smooth, moved = surface.smoothed(smoothing_mm)
+    around = f"smoothed around the valve over {smoothing_mm:g} mm, which moves it by at most"
+    done = [f"{around} {moved:.1f} mm"] * bool(moved)
+    given = smooth.vertices
+    fault: CrossingError | None = None
+    for _ in range(REPAIRS + 1):
         try:
-            check_surface(smooth.vertices, smooth.triangles)
-            if thickened:
-                fibre = np.tile([0.0, 0.0, 1.0], (len(smooth.vertices), 1))
-                band = smooth.vertices, smooth.triangles, smooth.region, ("anterior", "posterior")
-                thicken(LeafletSurface(*band, fibre, smooth.thickness))
-        except GeometryError as fault:
-            faults.append(fault)
+            _check(smooth, thickened)
+        except CrossingError as found:
+            fault, n = fault or found, len(given)
+            wrong = smooth.vertices[np.array(found.vertices) % n]
+            near = cdist(smooth.vertices, wrong).min(axis=1)
+            further, _ = smooth.smoothed(REPAIR_MM)
+            share = np.exp(-0.5 * (near / REPAIR_MM) ** 2)[:, None]
+            changed = smooth.vertices + share * (further.vertices - smooth.vertices)
+            smooth = replace(smooth, vertices=changed)
             continue
-        done = (
-            f"smoothed around the valve over {smoothing_mm + further:g} mm, which moves it by at "
-            f"most {moved:.1f} mm"
-        )
-        why = "; with less smoothing it passes through itself" if further else ""
-        return smooth, done + why if moved else ""
-    raise faults[0]
+        if fault is not None:
+            moved = float(np.linalg.norm(smooth.vertices - given, axis=1).max())
+            done.append(f"moved by at most {moved:.1f} mm where it passed through itself")
+        return smooth, "; ".join(done)
+    assert fault is not None
+    raise fault
+
+
+def _check(surface: Midsurface, thickened: bool) -> None:
+    """Raise a GeometryError unless a surface, and its walls if ``thickened``, are valid."""
+    check_surface(surface.vertices, surface.triangles)
+    if thickened:
+        fibre = np.tile([0.0, 0.0, 1.0], (len(surface.vertices), 1))
+        band = surface.vertices, surface.triangles, surface.region, ("anterior", "posterior")
+        thicken(LeafletSurface(*band, fibre, surface.thickness))
 
 
 def segmentation_std(voxel_mm: float, blur_mm: float, observer_mm: float) -> float:

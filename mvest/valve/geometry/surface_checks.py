@@ -5,7 +5,7 @@ Each fault raises a `GeometryError` that names the fault and the triangles, edge
 
 import numpy as np
 
-from mvest.errors import GeometryError
+from mvest.errors import CrossingError, GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import (
     has_intersections,
@@ -38,7 +38,7 @@ def check_surface(
 
     GeometryError for the first of these faults: wrong shape, not finite, no triangles, index out of
     range, degenerate triangle, duplicate triangle, non-manifold edge, inconsistent orientation,
-    non-manifold vertex, open surface, inward normals, self-intersection.
+    non-manifold vertex, open surface, inward normals, self-intersection (a CrossingError).
 
     Parameters
     ----------
@@ -72,9 +72,10 @@ def check_surface(
             )
         if has_intersections(points, faces):
             pairs = intersecting_triangles(points, faces, most=MAX_LOOKED_AT)
-            raise GeometryError(
+            raise CrossingError(
                 f"{name}: self-intersection: triangles pass through each other, among them "
-                f"{pairs[:5].tolist()}"
+                f"{pairs[:5].tolist()}",
+                np.unique(faces[pairs]).tolist(),
             )
 
 

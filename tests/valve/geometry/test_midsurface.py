@@ -9,9 +9,10 @@ from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
-from mvest.valve.anatomy.valve import Valve
+from mvest.valve.anatomy.valve import Valve, band_grid
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.segmented import without_crossings
 from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates
 from mvest.valve.geometry.thickening import ClosedSurface, thicken
@@ -120,3 +121,31 @@ def test_a_thick_ring_has_no_two_walls() -> None:
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     with pytest.raises(GeometryError, match="expected thin leaflets"):
         walls(*closed_band(ring, faces))
+
+
+def creased(depth_mm: float) -> Midsurface:
+    """A tube of 20 mm with walls 1 mm apart and a crease along it, as wide as two columns."""
+    columns, rows = 80, 9
+    grid = band_grid(columns, rows)
+    angle = 2.0 * np.pi * np.arange(columns) / columns
+    radius = np.full(columns, 10.0)
+    radius[[19, 20, 21]] -= [0.5 * depth_mm, depth_mm, 0.5 * depth_mm]
+    ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+    height = np.repeat(np.linspace(10.0, 0.0, rows), columns)[:, None]
+    points = np.hstack([np.tile(ring, (rows, 1)), height])
+    loops = np.arange(columns), np.arange(columns) + (rows - 1) * columns
+    return Midsurface(points, grid.triangles, grid.region, np.ones(len(points)), *loops, ())
+
+
+def test_a_crossing_is_smoothed_where_it_is() -> None:
+    surface = creased(5.0)
+    check_surface(surface.vertices, surface.triangles)
+    mended, done = without_crossings(surface, 0.0, thickened=True)
+    assert "passed through itself" in done
+    moved = np.linalg.norm(mended.vertices - surface.vertices, axis=1).reshape(9, -1)
+    assert moved.max() > 0.1
+    # Smoothing over 1 mm would shrink the whole tube by 0.05 mm.
+    assert np.delete(moved, np.arange(10, 31), axis=1).max() < 1e-3
+    same, done = without_crossings(surface, 0.0, thickened=False)
+    np.testing.assert_array_equal(same.vertices, surface.vertices)
+    assert done == ""
