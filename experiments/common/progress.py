@@ -149,8 +149,10 @@ def solving(title: str, model: ClosureModel, names: Sequence[str] = ()) -> Itera
     """A bar that a model of the closure moves; ``names`` as in `SolveBar`."""
     with SolveBar(title, len(model.settings.protocol.steps()), names) as bar:
         model.on_step = bar.step
-        yield bar
-        model.on_step = None
+        try:
+            yield bar
+        finally:
+            model.on_step = None
 
 
 class PartBar:

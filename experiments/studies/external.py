@@ -23,7 +23,7 @@ from experiments.common.study import Figures, Job, Result, Results, Study
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.exchange.external.contract import Command, files_of_command, read_points, write_points
-from mvest.exchange.external.model import Differences, ProcessModel
+from mvest.exchange.external.model import ProcessModel
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import Problem, estimate
 from mvest.problem.record import EstimateRecord, record_of
@@ -125,7 +125,6 @@ def model_of(
             "external.command is not given; expected the program and its arguments, such as "
             '[python,"{here}/solve.py","{request}","{folder}"]'
         )
-    steps = source.relative_step, source.floor, source.processes
     if missing := [path for path in source.inputs if not Path(path).exists()]:
         raise ConfigurationError(f"external.inputs: cannot read {', '.join(missing)}")
     return ProcessModel(
@@ -137,7 +136,10 @@ def model_of(
         points=None if about.points is None else _points(about.points, "points"),
         settings=settings,
         inputs=source.inputs,
-        differences=None if source.differences == "none" else Differences(*steps),
+        differences=source.differences != "none",
+        relative_step=source.relative_step,
+        floor=source.floor,
+        processes=source.processes,
     )
 
 

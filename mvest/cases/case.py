@@ -241,17 +241,19 @@ class ValveCase:
                 raise self._wrong("error samples", f"{what} they do")
 
     def __str__(self) -> str:
-        regions = ", ".join(self.surface.region_names)
-        frames = ", ".join(
-            f"{frame.name} ({frame.role.value.replace('_', ' ')}, {frame.pressure_mmHg:.3g} mmHg)"
+        surface, tips = self.surface, self.frame(Role.REFERENCE).papillary_tips
+        seen, length = self.uncertainty, self.uncertainty.correlation_length_mm
+        frames = (
+            f"frame {frame.name} ({frame.role.value}) at {frame.time:g} s, "
+            f"{frame.pressure_mmHg:.3g} mmHg, {len(frame.vertices)} vertices, "
+            f"{'same vertices as the reference' if frame.corresponds else 'no correspondence'}\n"
             for frame in self.frames
         )
-        seen, length = self.uncertainty, self.uncertainty.correlation_length_mm
         return (
-            f"case {self.name}{' (simulated)' if self.simulated else ''}: {regions}\n"
-            f"{len(self.surface.vertices)} vertices, {len(self.chordae.insertion)} chordae\n"
-            f"frames: {frames}\n"
-            f"seen within {seen.typical_mm:.3g} mm, "
+            f"case {self.name}{' (simulated)' if self.simulated else ''}\n"
+            f"{len(surface.vertices)} vertices, {len(surface.triangles)} triangles, leaflets "
+            f"{', '.join(surface.region_names)}; {len(self.chordae.insertion)} chordae from "
+            f"{len(tips)} papillary tips\n{''.join(frames)}seen within {seen.typical_mm:.3g} mm, "
             f"{f'correlated over {length:g} mm' if length else 'independent'}"
             + (f"; {len(self.error_samples)} error samples" if self.error_samples else "")
         )

@@ -8,7 +8,7 @@ frames, thickness in centimetres. No valve is closed here; it takes milliseconds
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,24 +16,15 @@ from scipy.spatial import cKDTree
 from mvest.cases.band import loop_vector_area
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.errors import GeometryError, InputError
+from mvest.quantities import Within
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
 from mvest.valve.measure.clinical import leaflet_length
 from mvest.valve.measure.coaptation import orifice_area
 
-
-class HumanRange(NamedTuple):
-    """Expected range of a quantity of a human mitral valve, and its source or derivation."""
-
-    low: float
-    high: float
-    unit: str
-    why: str
-
-
 RANGES = {
-    name: HumanRange(low, high, unit, why)
+    name: Within(low, high, unit, why)
     for name, low, high, unit, why in (
         ("ap_diameter", 15.0, 51.0, "mm", "24 ± 3 to 36 ± 5 mm, and three SD beyond: 3D "
          "echocardiography of normal and regurgitant valves, means and standard deviations"),
@@ -61,7 +52,7 @@ RANGES = {
         ("tip_motion", 0.0, 15.0, "mm", "papillary muscles shorten by less than a centimetre"),
     )
 }  # fmt: skip
-"""Expected ranges of a human mitral valve."""
+"""Expected ranges of a human mitral valve, each with its source or derivation."""
 
 LOST = (0.2, 4.0)
 """Stretches of vertices that do not correspond at all."""
@@ -96,10 +87,10 @@ def implausible_values(case: ValveCase) -> tuple[Implausible, ...]:
         values += _closing(case, case.closed)
     found = [*_exchanged(case)]
     for field, what, value, name, hint in values:
-        low, high, unit, _ = RANGES[name]
-        if not low <= value <= high:
-            text = f"{what} is {value:.3g} {unit}".rstrip()
-            text += f", expected {low:g} to {high:g} {unit}".rstrip()
+        expected = RANGES[name]
+        if not expected.low <= value <= expected.high:
+            text = f"{what} is {value:.3g} {expected.unit}".rstrip()
+            text += f", expected {expected.low:g} to {expected.high:g} {expected.unit}".rstrip()
             # A few outliers are not a mistake of the whole case: with one vertex in fifty wrong, 38
             # of 40 intervals held. Vertices in another order are far beyond.
             mistake = bool(hint) and (name != "stretch" or not LOST[0] < value < LOST[1])
@@ -118,8 +109,8 @@ def _anatomy(case: ValveCase) -> Iterator[Value]:
     """Thickness, chordae, annulus of each frame, leaflets and open orifice."""
     reference = case.frame(Role.REFERENCE)
     typical = float(np.median(case.surface.thickness))
-    low, high, *_ = RANGES["thickness"]
-    hint = "is it in cm?" if low <= 10 * typical <= high else ""
+    usual = RANGES["thickness"]
+    hint = "is it in cm?" if usual.low <= 10 * typical <= usual.high else ""
     yield "thickness", "the leaflets' typical thickness", typical, "thickness", hint
     ends = case.chordae.ends(np.asarray(reference.papillary_tips))
     length = case.chordae.along(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
@@ -206,34 +206,7 @@ class CaseFile(_Model):
         return [(where, name) for where, name in named if isinstance(name, str)]
 
 
-def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, str]:
-    """Dotted field and a sentence for one of pydantic's errors."""
-    path: list[int | str] = []
-    for part in loc:  # pydantic also names the alternatives of a type, which are not fields
-        if isinstance(part, int) or part in _place(path)[0].model_fields:
-            path.append(part)
-    if kind == "extra_forbidden":
-        path.append(loc[-1])
-    field = ".".join(str(part) for part in path)
-    if kind == "extra_forbidden":
-        model, _ = _place(path[:-1])
-        known = list(model.model_fields)
-        near = difflib.get_close_matches(str(path[-1]), known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
-        return field, f"unknown key; {hint}"
-    _, expected = _place(path)
-    if kind == "missing":
-        return field, f"is missing; expected {expected}"
-    shown = repr(value)
-    found = shown if len(shown) <= 60 else shown[:57] + "..."
-    if isinstance(value, str):
-        with suppress(ValueError):
-            float(value)
-            found += " (this is text: YAML wants numbers like 1.0e-3, without quotes)"
-    return field, f"found {found}; expected {expected}"
-
-
-PARTS: Mapping[str | int, type[BaseModel]] = {
+PARTS: Mapping[str, type[BaseModel]] = {
     "units": Units,
     "thickness": PointData,
     "frames": FrameEntry,
@@ -245,15 +218,32 @@ PARTS: Mapping[str | int, type[BaseModel]] = {
 """Fields that are models themselves."""
 
 
-def _place(path: Sequence[int | str]) -> tuple[type[BaseModel], str]:
-    """The model that a path leads to (or through last), and the description of its last field."""
-    model: type[BaseModel] = CaseFile
-    description = "a mapping of fields"
-    for part in path:
-        if part in model.model_fields:
-            description = model.model_fields[str(part)].description or description
+def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, str]:
+    """Dotted field and a sentence for one of pydantic's errors."""
+    path: list[str] = []
+    model, expected = cast("type[BaseModel]", CaseFile), "a mapping of fields"
+    for part in loc:  # pydantic also names the alternatives of a type, which are not fields
+        if isinstance(part, int):
+            path.append(str(part))
+        elif part in model.model_fields:
+            path.append(part)
+            expected = model.model_fields[part].description or expected
             model = PARTS.get(part, model)
-    return model, description
+    if kind == "extra_forbidden":
+        known = list(model.model_fields)
+        near = difflib.get_close_matches(str(loc[-1]), known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
+        return ".".join([*path, str(loc[-1])]), f"unknown key; {hint}"
+    field = ".".join(path)
+    if kind == "missing":
+        return field, f"is missing; expected {expected}"
+    shown = repr(value)
+    found = shown if len(shown) <= 60 else shown[:57] + "..."
+    if isinstance(value, str):
+        with suppress(ValueError):
+            float(value)
+            found += " (this is text: YAML wants numbers like 1.0e-3, without quotes)"
+    return field, f"found {found}; expected {expected}"
 
 
 CASE_FILE = "case.yaml"

@@ -14,9 +14,8 @@ import os
 import resource
 import struct
 import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from subprocess import PIPE
 from typing import Any, BinaryIO
@@ -30,7 +29,7 @@ from mvest.provenance import THREAD_VARIABLES
 from mvest.reading.text import MAX_LINE, one_line
 
 MEMORY_GB, SECONDS = 3.0, 60.0
-"""Limits of a call: GiB of address space beyond the bare process; s of CPU and wall time."""
+"""Limits of a call: GiB of address space beyond the bare process; s."""
 
 _lock = threading.Lock()
 _child: Program | None = None
@@ -167,13 +166,13 @@ def main() -> None:
 def _answered(call: dict[str, Any]) -> dict[str, Any]:
     module, name = call["function"]
     path, *arguments = call["arguments"]
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     try:
         function = getattr(importlib.import_module(module), name)
-        with (
-            _limited(resource.RLIMIT_CPU, int(time.process_time() + call["seconds"]) + 1),
-            _limited(resource.RLIMIT_AS, _size() + int(call["memory_gb"] * 2**30)),
-        ):
-            return {"result": function(Path(path), *arguments)}
+        amount = _size() + int(call["memory_gb"] * 2**30)
+        least = min(n for n in (amount, soft, hard) if n != resource.RLIM_INFINITY)
+        resource.setrlimit(resource.RLIMIT_AS, (least, hard))
+        return {"result": function(Path(path), *arguments)}
     except MvestError as error:
         return {"error": type(error).__name__, "message": str(error)}
     except ImportError as error:
@@ -184,18 +183,8 @@ def _answered(call: dict[str, Any]) -> dict[str, Any]:
         return {"error": "InputError", "message": reason}
     except Exception as error:  # libraries fail in many ways on a damaged file
         return {"error": "InputError", "message": f"damaged: {str(error) or type(error).__name__}"}
-
-
-@contextmanager
-def _limited(what: int, amount: int) -> Iterator[None]:
-    """Lower the soft limit of a resource."""
-    soft, hard = resource.getrlimit(what)
-    least = min(n for n in (amount, soft, hard) if n != resource.RLIM_INFINITY)
-    resource.setrlimit(what, (least, hard))
-    try:
-        yield
     finally:
-        resource.setrlimit(what, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def _size() -> int:

@@ -8,7 +8,7 @@ surfaces, pandas tables, nibabel label maps.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ FINE_MM, MARGIN_MM = 0.2, 6.0
 class ArrivalSettings:
     """How the geometry of a virtual patient is exported."""
 
-    kind: str  #: vertices, surfaces, slicerheart or labels
+    kind: Literal["vertices", "surfaces", "slicerheart", "labels"]
     label: str  #: name in tables
     seen_with_errors: bool = False  #: the closed surface has the errors of the patient's case
     voxel_mm: Length | None = None  #: of a label map
@@ -78,8 +78,8 @@ def arrive(
 
     ``positions (n, 3)`` mm are the true ones of its vertices in the closed frame, ``registration
     (6,)`` their displacement against the annulus and the tips that the case states. Exported and
-    imported files are left in the folder, which must be empty. MvestError if the kind is unknown,
-    or the importer refuses the export.
+    imported files are left in the folder, which must be empty. MvestError if the
+    importer refuses the export.
     """
     opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
     patient = Arrived(case, opened, replace(closed, vertices=positions))
@@ -89,9 +89,6 @@ def arrive(
         return patient
     if arrival.kind == "surfaces":
         return replace(patient, case=replace(case, frames=(opened, closed)))
-    if arrival.kind not in KINDS:
-        known = ", ".join(KINDS)
-        raise ConfigurationError(f"arrival.kind = {arrival.kind!r}, expected one of {known}")
     # Leaflets, annulus and tips are drawn in one image.
     tips = displace(closed.papillary_tips, registration, closed.annulus.mean(axis=0))
     closed = replace(closed, annulus=drawn[case.annulus], papillary_tips=tips)

@@ -8,7 +8,7 @@ part of their way, each in equilibrium. Motions that no valve shows are
 refused, so that no detector learns from them.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -164,12 +164,6 @@ class DrawnValve:
     #: (2, 3) mm, displacement of the papillary tips from the closed to the open valve.
     tip_motion: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
 
-    def __post_init__(self) -> None:
-        if np.shape(self.tip_motion) != (2, 3):
-            raise InputError(
-                f"motion of the tips: shape {np.shape(self.tip_motion)}, expected (2, 3)"
-            )
-
     def sampled(self, columns: int, rows: int) -> Valve:
         """The valve on ``columns x rows`` vertices; its tips move while it closes."""
         valve = self.template.valve(columns, rows)
@@ -180,43 +174,12 @@ class DrawnValve:
 
 
 def close_in_motion(drawn: DrawnValve, settings: MotionSettings) -> MovingValve:
-    """Close a valve, hold it, and return its frames.
-
-    Raises RefusedError if it does not close, or beyond its `MotionLimits`; InputError or
-    MaterialError if a value is inadmissible.
-    """
-    closing, tips, model = closing_frames(drawn, settings)
-    pressure = drawn.mechanics.protocol.pressure_mmHg
-    pressures = [share * pressure for share in settings.held_pressure]
-    states = held_states(model.contact_valve, pressures, settings.held_relaxation)
-    at = np.array([drawn.values[parameter] for parameter in model.names])
-    held = []
-    for state, vertices in zip(states, model.held(at, states), strict=True):
-        if vertices is None:
-            raise RefusedError(
-                drawn.name, f"closed it has no equilibrium under {state.pressure_mmHg:.0f} mmHg"
-            )
-        held.append(vertices)
-    tips = [*tips, *(state.papillary_tips for state in states)]
-    return moving_valve(drawn, settings, [*closing, *held], tips, settings.frames - 1)
-
-
-def closing_frames(
-    drawn: DrawnValve, settings: MotionSettings
-) -> tuple[list[FloatArray], list[FloatArray], ClosureModel]:
-    """The frames of a valve up to the closed one, without checks.
+    """Close a valve, hold it, and return its frames; the first one is open.
 
     Pressure and ramp are those of the mechanics' protocol, the steps those of ``settings``.
 
-    RefusedError if the valve does not close.
-
-    Returns
-    -------
-    vertices : list of (n, 3) mm
-        Of the layout, in the open frame, those of closing, and the closed one.
-    tips : list of (2, 3) mm
-    model : ClosureModel
-        It has been closed with the values of the valve.
+    Raises RefusedError if it does not close, or beyond its `MotionLimits`; InputError or
+    MaterialError if a value is inadmissible.
     """
     mesh = structured_mesh(
         drawn.template, settings.element, settings.mesh_columns, settings.mesh_rows
@@ -244,7 +207,32 @@ def closing_frames(
     chosen = frames_along(positions[:, seen.free_edge], settings.frames)
     phase = np.array([protocol.phase(time) for time in simulation.times[chosen]])
     start, end = seen.motion.papillary_tips
-    return list(positions[chosen]), list(start + phase[:, None, None] * (end - start)), model
+    vertices = list(positions[chosen])
+    tips = list(start + phase[:, None, None] * (end - start))
+    pressures = [share * protocol.pressure_mmHg for share in settings.held_pressure]
+    states = held_states(model.contact_valve, pressures, settings.held_relaxation)
+    for state, held in zip(states, model.held(at, states), strict=True):
+        if held is None:
+            raise RefusedError(
+                drawn.name, f"closed it has no equilibrium under {state.pressure_mmHg:.0f} mmHg"
+            )
+        vertices.append(held)
+        tips.append(state.papillary_tips)
+    layout, count = ValveLayout(settings.columns, settings.rows), len(vertices)
+    places = drawn.template.chord_places()
+    valve = MovingValve(
+        name=drawn.name,
+        layout=layout,
+        times=settings.duration * np.arange(count) / (count - 1),
+        vertices=np.stack(vertices),
+        tips=np.stack(tips),
+        thickness=drawn.template.thickness(layout.phi, layout.s),
+        chord_phi=np.mod(places.phi, 360.0),
+        chord_s=places.s,
+        chord_tip=places.tip[: len(places.phi)],
+    )
+    check_motion(valve, settings.frames - 1, settings.limits)
+    return valve
 
 
 def held_states(
@@ -268,35 +256,6 @@ def held_states(
         )
         for pressure, back in zip(pressures_mmHg, relaxations, strict=True)
     ]
-
-
-def moving_valve(
-    drawn: DrawnValve,
-    settings: MotionSettings,
-    vertices: Sequence[FloatArray],
-    tips: Sequence[FloatArray],
-    closed: int,
-) -> MovingValve:
-    """A valve in two or more frames, ``vertices (n, 3)`` and ``tips (2, 3)`` mm.
-
-    The first frame is open, ``closed`` the number of the closed one. Raises RefusedError if the
-    valve is beyond the limits of the settings.
-    """
-    layout, count = ValveLayout(settings.columns, settings.rows), len(vertices)
-    places = drawn.template.chord_places()
-    valve = MovingValve(
-        name=drawn.name,
-        layout=layout,
-        times=settings.duration * np.arange(count) / (count - 1),
-        vertices=np.stack(vertices),
-        tips=np.stack(tips),
-        thickness=drawn.template.thickness(layout.phi, layout.s),
-        chord_phi=np.mod(places.phi, 360.0),
-        chord_s=places.s,
-        chord_tip=places.tip[: len(places.phi)],
-    )
-    check_motion(valve, closed, settings.limits)
-    return valve
 
 
 def frames_along(points: FloatArray, count: int) -> IntArray:

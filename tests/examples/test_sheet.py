@@ -9,7 +9,7 @@ import pytest
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log
 from mvest.exchange.external.contract import Command, RunRequest, read_answer, write_request
-from mvest.exchange.external.model import Differences, ProcessModel
+from mvest.exchange.external.model import ProcessModel
 from tests.places import ROOT
 
 pytest.importorskip("skfem")
@@ -110,7 +110,6 @@ def test_the_program_predicts_what_the_library_predicts(tmp_path):
         len(TINY.points),
         units=("MPa", "MPa"),
         settings={"cells": [2, 2], "observed": [4, 3], "load_steps": 2},
-        differences=Differences(1e-3),
     )
     answer = program(M)
     assert answer.converged, answer.reason

@@ -30,7 +30,7 @@ from mvest.exchange.exporting.febio import (
     FebioOptions,
     valve_document,
 )
-from mvest.exchange.febio.document import LAWS, NAMES, FebDocument, febio_law, febio_mesh
+from mvest.exchange.febio.document import LAWS, NAMES, FebDocument, febio_law
 from mvest.files import write_atomically
 from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.integrate import simulate
@@ -50,7 +50,7 @@ from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from tests.exchange.febio.program import FebRun, run_febio
+from tests.exchange.febio.program import FebRun, febio_mesh, run_febio
 from tests.mechanics.bodies import SaintVenantKirchhoff
 from tests.places import ROOT
 from tests.tables import markdown, write_text
@@ -253,7 +253,8 @@ def valve(settings: FebioOptions) -> tuple[list[dict[str, Any]], list[dict[str, 
     contact, orthotropic = settings.contact, settings.law == "orthotropic"
     model = valve_model(contact)
     with tempfile.TemporaryDirectory() as folder:
-        document = valve_document(model, GENERIC, settings)
+        own = replace(model, mesh=febio_mesh(model.mesh))
+        document = valve_document(own, GENERIC, settings)
         run = run_febio(document, model.mesh, Path(folder) / "valve.feb", time_limit_s=1800.0)
     seen = model.observed(run.frames[-1])
     system, _ = valve_model("potential").tuned(GENERIC)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.schema import Values
-from mvest.errors import ConfigurationError, InputError
+from mvest.errors import ConfigurationError
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import observation_noise
 from mvest.estimation.run import Filter
@@ -27,10 +27,9 @@ def build_filter(
     """
     mean, P0 = np.array(settings["initial"], dtype=float), settings["P0"]
     require_one_each("filter.initial", mean, parameters)
-    numbers = _as_numbers("filter.P0", P0)
     try:
-        prior = Gaussian.from_variance(mean, numbers)
-    except InputError as error:
+        prior = Gaussian.from_variance(mean, P0)
+    except (TypeError, ValueError) as error:
         raise ConfigurationError(f"filter.P0 = {P0}: {error}") from error
     transform: Transform = Identity()
     if settings["transform"] == "log":
@@ -66,19 +65,10 @@ def require_one_each(name: str, values: FloatArray, parameters: tuple[str, ...])
         )
 
 
-def observation_variance(R: Any) -> float | FloatArray:
+def observation_variance(R: Any) -> FloatArray:
     """``filter.R``, mm²: one positive variance, or one for each observed frame."""
-    variance = _as_numbers("filter.R", R)
     try:
-        observation_noise(np.atleast_1d(variance), np.size(variance))
-    except InputError as error:
+        observation_noise(np.atleast_1d(R), np.size(R))
+    except (TypeError, ValueError) as error:
         raise ConfigurationError(f"filter.R = {R}: {error}") from error
-    return variance
-
-
-def _as_numbers(name: str, value: Any) -> float | FloatArray:
-    try:
-        numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} = {value!r}, expected a number or numbers") from None
-    return float(numbers) if numbers.ndim == 0 else numbers
+    return np.asarray(R, dtype=np.float64)

@@ -9,7 +9,7 @@ import numpy as np
 from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.schema import Values
 from mvest.cases.folder import write_case
-from mvest.errors import ConfigurationError, InputError
+from mvest.errors import InputError
 from mvest.problem.stored import entry_of
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
@@ -42,13 +42,8 @@ class PatientPlace:
             raise InputError(f"{self.hidden} does not hold a patient's truth: {error}") from error
 
 
-def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:
-    """Simulate the configured patient, unless it is cached; returns its folders.
-
-    Raises a `ConfigurationError` if none is configured.
-    """
-    if patient is None:
-        raise ConfigurationError("patient is not given; expected one of conf/patient")
+def make_patient(values: Values, patient: PatientSettings) -> PatientPlace:
+    """Simulate the configured patient, unless it is cached; returns its folders."""
     described = {
         "patient": {k: v for k, v in values["patient"].items() if not k.startswith("paper")},
         **{key: values[key] for key in ("valve", "mechanics", "seed")},

@@ -22,9 +22,8 @@ from experiments.common.progress import solving
 from experiments.common.schema import Values, validated
 from mvest.cache import content_digest
 from mvest.closure.model import ClosureModel
-from mvest.errors import ConfigurationError, InputError
+from mvest.errors import ConfigurationError
 from mvest.estimation.prediction import SharedStart
-from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings, Relaxation, TissueSettings
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.valve_system import check_parameters, material_law
@@ -87,11 +86,6 @@ def build_truth(
 
 def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSettings:
     """The estimator's mechanics with the truth's changes."""
-    for name in truth["fixed"]:
-        try:
-            kind_of(name)
-        except InputError as error:
-            raise ConfigurationError(f"truth.fixed: {error}") from error
     tissue = validated(dict[str, TissueSettings], truth["tissue"], "truth.tissue")
     if not set(tissue) <= set(settings.tissue):
         raise ConfigurationError(

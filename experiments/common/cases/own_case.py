@@ -10,7 +10,7 @@ from experiments.common.progress import PartBar, SolveBar, say, solving
 from experiments.common.records.record import FIELDS, NOT_GATED, Mesh, Model, Record, has_passed
 from experiments.common.schema import InputFile, Reads, Values, build, contents
 from experiments.common.study import Result
-from mvest.cases.case import Role, ValveCase
+from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.detected import (
     CASE,
@@ -226,7 +226,7 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
     coarse = build_coarse(case, settings, mesh_store(values))
     figure = frames_figure(case, coarse.contact_reach_mm)
     drawn = save_figure_with(folder / "case", figure, f"case {case.sha256[:12]}")
-    lines = _described(case)
+    lines = [*str(case).splitlines(), *(f"derived: {sentence}" for sentence in case.derived)]
     if gate:
         with PartBar(f"{case.name}, gate", 1, "test") as bar:
             lines += gate_lines(gate_case(case, settings, mesh_store(values)))
@@ -252,22 +252,4 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
     texts = [f"{name}\n{one.text()}" for name, one in expected_tables(expected).items()]
     if not expected.unknowns:
         texts.insert(0, f"how well moduli could be estimated is not known: {expected.reason}")
-    return "\n".join([case.name, *lines, *texts, f"drawn and written: {page}"])
-
-
-def _described(case: ValveCase) -> list[str]:
-    """A case in lines of text."""
-    surface, tips = case.surface, case.frame(Role.REFERENCE).papillary_tips
-    lines = [
-        f"{len(surface.vertices)} vertices, {len(surface.triangles)} triangles, leaflets "
-        f"{', '.join(surface.region_names)}; {len(case.chordae.insertion)} chordae from "
-        f"{len(tips)} papillary tips"
-    ]
-    for frame in case.frames:
-        same = "same vertices as the reference" if frame.corresponds else "without correspondence"
-        lines.append(
-            f"frame {frame.name} ({frame.role.value}) at {frame.time:g} s, "
-            f"{frame.pressure_mmHg:g} mmHg, {len(frame.vertices)} vertices"
-            + ("" if frame.role is Role.REFERENCE else f", {same}")
-        )
-    return [*lines, *(f"derived: {sentence}" for sentence in case.derived)]
+    return "\n".join([*lines, *texts, f"drawn and written: {page}"])

@@ -159,7 +159,7 @@ def _nees(estimate: EstimateRecord) -> float | None:
 
 def check_patient(values: Values, folder: Path) -> str:
     """Check a virtual patient's case; simulate it first if necessary."""
-    patient = values["patient"] and build(PatientSettings, values["patient"])
+    patient = build(PatientSettings, values["patient"])
     return check(values, read_case(make_patient(values, patient).case), folder)
 
 

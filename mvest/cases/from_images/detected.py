@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -38,7 +38,7 @@ from mvest.imaging.learning.accuracy import unlike_share
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
-from mvest.quantities import BeatTime, Count, Pressure, Share, Thickness
+from mvest.quantities import BeatTime, Count, Pressure, Share, Thickness, within
 from mvest.reading.text import read_numbers
 from mvest.typing import FloatArray
 
@@ -62,7 +62,7 @@ class ImagedSettings:
     """What a case needs that the file of a volume does not state."""
 
     model: str | None = None  #: file of the detection model; None: the package's, for ultrasound
-    modality: str | None = None  #: ultrasound, ct or mr, if the file does not state it
+    modality: Literal["ultrasound", "ct", "mr"] | None = None  #: if the file does not state it
     frame_interval_s: BeatTime | None = None  #: if the file states no times
     time_unit: str | None = None  #: s or ms, if the file states times without a unit
     open_frame: Count | None = None  #: None: the frame with the largest orifice
@@ -71,7 +71,8 @@ class ImagedSettings:
     pressure_curve: str | None = None  #: .csv of time,pressure (s, mmHg) instead
     thickness_mm: tuple[Thickness, ...] = ()  #: of the LEAFLETS; empty: generic
     min_confidence: Share = MIN_CONFIDENCE  #: of the best frame, and of the frames that are chosen
-    error_samples: Count = 200  #: at most, from held-out volumes; mirror images are added
+    #: At most, from held-out volumes; their mirror images are added.
+    error_samples: Annotated[int, within(2, 250, "", "with mirror images, those of a case")] = 200
     name: str | None = None  #: None: made of the file's content, as files are named after patients
     description: str = ""
     source: str = ""
@@ -79,11 +80,6 @@ class ImagedSettings:
     simulated: bool = False  #: the volume comes from a simulation
 
     def __post_init__(self) -> None:
-        known = [modality.value for modality in Modality]
-        if self.modality is not None and self.modality not in known:
-            raise InputError(
-                f"imaged.modality = {self.modality!r}, expected one of {', '.join(known)}"
-            )
         if self.thickness_mm and len(self.thickness_mm) != len(LEAFLETS):
             raise InputError(
                 f"imaged.thickness_mm = {list(self.thickness_mm)}, expected one number for each of "

@@ -10,7 +10,7 @@ from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, require_numbers
-from mvest.exchange.febio.document import LAWS, FebDocument, febio_law, febio_mesh, opposite_faces
+from mvest.exchange.febio.document import LAWS, FebDocument, febio_law, opposite_faces
 from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.forces.trees import SUPPORT
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
@@ -129,7 +129,7 @@ def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
             raise InputError(f"case {case.name}: no closed frame; give pressure_mmHg=...")
         pressure = case.closed.pressure_mmHg
     valve = GivenValve(case.valve)
-    mesh = valve.layers("hex18", options.columns, options.rows)
+    mesh = valve.layers("hex27", options.columns, options.rows)
     contact = valve.valve(CONTACT_COLUMNS, CONTACT_ROWS)
     mechanics = MechanicsSettings(settings, ClosureProtocol(pressure_mmHg=pressure))
     fixed = {f"E_f.{name}": value for name, value in zip(names, chosen["E_f"], strict=True)}
@@ -139,12 +139,11 @@ def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
 def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) -> FebDocument:
     """FEBio input for the closure of a valve at parameters ``m (p,)``.
 
-    InputError or MaterialError if FEBio has no counterpart for the mesh, or a modulus is
-    inadmissible.
+    The mesh has elements in `NAMES`. MaterialError if a modulus is inadmissible.
     """
     values = {**model.fixed, **dict(zip(model.names, map(float, m), strict=True))}
     mechanics, protocol = model.settings, model.settings.protocol
-    mesh = febio_mesh(model.mesh)
+    mesh = model.mesh
     unhindered = replace(mechanics, contact=replace(mechanics.contact, active=False))
     system = build_system(model.valve, model.contact_valve, mesh, unhindered, values)
     cables, hinge = system.cables, system.hinge

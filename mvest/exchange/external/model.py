@@ -28,38 +28,6 @@ from mvest.reading.documents import validated
 from mvest.typing import FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class Differences:
-    """Central difference quotients ``(h(m + d) - h(m - d)) / 2d``: two runs per parameter.
-
-    The error is second order in the step. The program's solver tolerance adds an error of tolerance
-    over step, so choose a step much larger than the tolerance.
-    """
-
-    relative_step: float = 1e-3  #: step relative to the size of a parameter
-    floor: float = 0.0  #: smallest size of a parameter, in its unit; needed if it may be zero
-    processes: int = 1  #: number of simultaneous runs
-
-    def __post_init__(self) -> None:
-        if not (0 < self.relative_step < 1 and self.floor >= 0 and self.processes >= 1):
-            raise ConfigurationError(
-                f"{self}, expected 0 < relative_step < 1 and no negative floor"
-            )
-
-    def neighbours(self, m: FloatArray) -> FloatArray:
-        """Parameters ``(2 p, p)`` of the runs: upper neighbours of ``m``, then lower neighbours.
-
-        InputError if a parameter is so small that its step vanishes.
-        """
-        step = self.relative_step * np.maximum(np.abs(m), self.floor)
-        if len(bad := np.flatnonzero(m + step == m)):
-            raise InputError(
-                f"parameter {bad[0]} is {m[bad[0]]:g}, and so is its step; expected a floor, its "
-                "usual size"
-            )
-        return np.concatenate([m + np.diag(step), m - np.diag(step)])
-
-
 @dataclass(slots=True, eq=False)
 class ProcessModel:
     """Coordinates ``(3 n,)`` mm that a program predicts for parameters ``(p,)``.
@@ -89,8 +57,15 @@ class ProcessModel:
     inputs : sequence of str
         Files and folders that affect the predictions, in addition to those named in the command. A
         run is not reused if any of their contents has changed.
-    differences : Differences or None
-        How to differentiate if the program does not; None requires it to.
+    differences : bool
+        Whether to use central differences ``(h(m + d) - h(m - d)) / 2d`` if the program gives no
+        derivatives: two runs per parameter. Their error is second order in the step. The program's
+        solver tolerance adds an error of tolerance over step, so choose a step much larger than it.
+    relative_step, floor : float
+        Step relative to the size of a parameter, and the smallest size, in its unit; needed if a
+        parameter may be zero.
+    processes : int
+        Number of simultaneous runs.
     """
 
     command: Command
@@ -102,7 +77,10 @@ class ProcessModel:
     points: FloatArray | None = None
     settings: Mapping[str, Any] | None = None
     inputs: Sequence[str] = ()
-    differences: Differences | None = Differences()
+    differences: bool = True
+    relative_step: float = 1e-3
+    floor: float = 0.0
+    processes: int = 1
     runs: int = field(default=0, init=False)  #: number of started runs
     #: whether the program itself gave the last derivatives
     own_jacobian: bool = field(default=False, init=False)
@@ -135,15 +113,18 @@ class ProcessModel:
 
     def by_differences(self, m: FloatArray) -> FloatArray | str:
         """Derivatives ``(3 n, p)`` of the prediction at ``m``, or the reason why there are none."""
-        if self.differences is None:
+        if not self.differences:
             return "no derivatives: jacobian.csv is missing, differences=none"
-        try:
-            points = self.differences.neighbours(m)
-        except InputError as error:
-            return str(error)
+        step = self.relative_step * np.maximum(np.abs(m), self.floor)
+        if len(bad := np.flatnonzero(m + step == m)):
+            return (
+                f"parameter {bad[0]} is {m[bad[0]]:g}, and so is its step; expected a floor, its "
+                "usual size"
+            )
+        points = np.concatenate([m + np.diag(step), m - np.diag(step)])
         found: list[Prediction] = []
-        for first in range(0, len(points), self.differences.processes):
-            batch = points[first : first + self.differences.processes]
+        for first in range(0, len(points), self.processes):
+            batch = points[first : first + self.processes]
             for at, one in zip(batch, self._predictions(batch, jacobian=False), strict=True):
                 if not one.converged:
                     values = ", ".join(f"{n} = {v:g}" for n, v in zip(self.names, at, strict=True))
@@ -205,9 +186,12 @@ def _result(folder: Path, request: RunRequest, failure: str) -> Prediction:
     try:
         answer = read_answer(folder, request)
     except InputError as error:
-        answer = Prediction.failed(str(error))
-    if not answer.converged and not (failure and "missing" in answer.reason):
-        failure = "; ".join(filter(None, [failure, answer.reason]))
+        # A program that failed has often written no response.
+        explained = failure and "missing" in str(error)
+        failure = failure if explained else "; ".join(filter(None, [failure, str(error)]))
+    else:
+        if not answer.converged:
+            failure = "; ".join(filter(None, [failure, answer.reason]))
     if not failure:
         return answer
     (folder / RESPONSE).unlink(missing_ok=True)

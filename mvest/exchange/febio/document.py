@@ -17,7 +17,6 @@ edges; for a brick also the midpoints of its sides, its lower and its upper face
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as Xml
@@ -25,7 +24,6 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.mechanics.body import outer_faces
 from mvest.mechanics.law.moduli import TransverselyIsotropic
@@ -50,8 +48,6 @@ NAMES = {
     "wedge18": ("penta15", {}, WEDGE),
 }
 """Element -> FEBio's name, integration rule if there is a choice, and nodes."""
-UPRIGHT = {"hex18": "hex27", "wedge12": "wedge18"}
-"""Elements that need extra nodes halfway through the thickness."""
 AXES = ("x", "y", "z")
 SECTIONS = ("Module", "Control", "Material", "Mesh", "MeshDomains", "MeshData", "Boundary", "Loads",
             "Contact", "Constraints", "Discrete", "LoadData", "Output")  # fmt: skip
@@ -72,35 +68,6 @@ def febio_law(tissue: TransverselyIsotropic, kind: str = "orthotropic") -> FebLa
         "G12": tissue.G, "G23": across, "G31": tissue.G,
         "v12": tissue.nu_fp, "v23": tissue.nu_pp, "v31": tissue.nu_fp * tissue.E_p / tissue.E_f,
     }  # fmt: skip
-
-
-def febio_mesh(mesh: SolidMesh) -> SolidMesh:
-    """The mesh converted to elements in `NAMES`; the nodes of ``mesh`` come first.
-
-    Elements with two layers of nodes get a third one halfway between them.
-
-    InputError if FEBio has no such element.
-    """
-    kind = mesh.element_type
-    if kind in NAMES:
-        return mesh
-    if kind not in UPRIGHT:
-        raise InputError(f"FEBio has nothing like the element {kind}")
-    half = mesh.reference.n_nodes // 2
-    low, high = mesh.elements[:, :half], mesh.elements[:, half:]
-    pairs, number = np.unique(
-        np.stack([low, high], axis=-1).reshape(-1, 2), axis=0, return_inverse=True
-    )
-    middle = len(mesh.nodes) + number.reshape(low.shape)
-    fibre = mesh.fibre[:, :half] + mesh.fibre[:, half:]
-    fibre /= np.linalg.norm(fibre, axis=2, keepdims=True)
-    return replace(
-        mesh,
-        nodes=np.vstack([mesh.nodes, mesh.nodes[pairs].mean(axis=1)]),
-        elements=np.hstack([low, middle, high]),
-        element_type=UPRIGHT[kind],
-        fibre=np.concatenate([mesh.fibre[:, :half], fibre, mesh.fibre[:, half:]], axis=1),
-    )
 
 
 def opposite_faces(mesh: SolidMesh) -> IntArray:
@@ -125,7 +92,7 @@ def opposite_faces(mesh: SolidMesh) -> IntArray:
 class FebDocument:
     """One body; each method adds a load, constraint or interaction.
 
-    ``mesh`` has FEBio elements (`febio_mesh`); ``laws`` has one material per region. ``end`` (s) is
+    ``mesh`` has elements in `NAMES`; ``laws`` has one material per region. ``end`` (s) is
     the end time, ``step`` (s) the first and largest time step. ``tolerance`` is relative for
     displacements; its square applies to the energy. ``dynamic`` uses inertia (generalised alpha at
     its most dissipative) and BFGS; otherwise the run is static with Newton's method. ``further

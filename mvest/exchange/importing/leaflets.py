@@ -4,18 +4,20 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from mvest.cases.band import LARGEST_THICKNESS
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.frames import MM_PER
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.leaflet_parts import Content, Tissue, filled_frames, tissue_of
-from mvest.exchange.importing.written import REGIONS, FoundFrame, case_of_frames, check_options
+from mvest.exchange.importing.written import REGIONS, FoundFrame, Pair, Tips, case_of_frames
 from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
 from mvest.exchange.volumes import LabelMap, read_labels
+from mvest.quantities import Place, Pressure, within
 from mvest.reading.text import named
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
@@ -85,23 +87,17 @@ class LeafletsOptions:
     open: int | None = None
     closed: Any = None
     units: str | None = None
-    tips: tuple[float, ...] | None = None
-    tips_closed: tuple[float, ...] | None = None
-    muscles: tuple[str, ...] | None = None
-    anterior_point: tuple[float, ...] | None = None
-    pressure_mmHg: float | None = None
-    thickness_mm: tuple[float, ...] | None = None
-    thickness_range_mm: tuple[float, ...] | None = None
-    edge_mm: float = 1.2
-    smoothing_mm: float = 0.0
-    observer_mm: float = OBSERVER_MM
+    tips: Tips | None = None
+    tips_closed: Tips | None = None
+    muscles: Annotated[tuple[str, ...], Field(min_length=2, max_length=2)] | None = None
+    anterior_point: tuple[Place, Place, Place] | None = None
+    pressure_mmHg: Pressure | None = None
+    thickness_mm: Pair | None = None
+    thickness_range_mm: Pair | None = None
+    edge_mm: Annotated[float, within(0.3, 5, "mm", "")] = 1.2
+    smoothing_mm: Annotated[float, within(0, 10, "mm", "")] = 0.0
+    observer_mm: Annotated[float, within(0, 5, "mm", "")] = OBSERVER_MM
     mirrored: bool = False
-
-    def __post_init__(self) -> None:
-        counts = {"tips": 6, "tips_closed": 6, "anterior_point": 3}
-        pairs = dict.fromkeys(("muscles", "thickness_mm", "thickness_range_mm"), 2)
-        limits = {"edge_mm": (0.3, 5), "smoothing_mm": (0, 10), "observer_mm": (0, 5)}
-        check_options(self, counts | pairs, limits)
 
     def words(self, name: str) -> tuple[str, ...]:
         """Names, numbers or files of an option, which may be a single one or a list."""
@@ -295,6 +291,8 @@ def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) ->
         thickness = np.array(options.thickness_mm)[of_vertex]
     if options.thickness_range_mm is not None:
         low, high = options.thickness_range_mm
+        if low > high:
+            raise InputError(f"thickness_range_mm=[{low:g},{high:g}], expected the smaller first")
         thin, thick = (100 * np.mean(outside) for outside in (thickness < low, thickness > high))
         derived.append(
             f"thickness: clipped to {low:g} mm ({thin:.0f} % of the vertices are thinner) and "

@@ -7,10 +7,11 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import yaml
+from pydantic import Field
 
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case
@@ -19,6 +20,7 @@ from mvest.cases.schema import CASE_FILE
 from mvest.cases.tissue import write_chordae
 from mvest.errors import InputError, MvestError
 from mvest.exchange.surfaces import Data, Surface, write_surface
+from mvest.quantities import Place, Thickness
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.midsurface import Midsurface
@@ -26,23 +28,10 @@ from mvest.valve.geometry.midsurface import Midsurface
 REGIONS = ("anterior", "posterior")
 
 
-def check_options(
-    options: object, counts: Mapping[str, int], limits: Mapping[str, tuple[float, float]]
-) -> None:
-    """Check the lengths of list options and the limits of numbers.
-
-    InputError if a list has the wrong length, or a number is not finite or beyond its limits.
-    """
-    for name, count in counts.items():
-        given = getattr(options, name)
-        if given is None:
-            continue
-        finite = all(isinstance(one, str) or np.isfinite(one) for one in given)
-        if len(given) != count or not finite:
-            raise InputError(f"{name}={list(given)}, expected {count} of them")
-    for name, (low, high) in limits.items():
-        if not low <= (value := getattr(options, name)) <= high:
-            raise InputError(f"{name}={value}, expected {low:g} to {high:g}")
+Tips: TypeAlias = Annotated[tuple[Place, ...], Field(min_length=6, max_length=6)]
+"""Coordinates of two papillary tips, antero-lateral and postero-medial."""
+Pair: TypeAlias = Annotated[tuple[Thickness, ...], Field(min_length=2, max_length=2)]
+"""Thickness of the anterior and the posterior leaflet, or two bounds."""
 
 
 def check_sides(left: str, to_left: FloatArray, to_front: FloatArray, down: FloatArray) -> None:

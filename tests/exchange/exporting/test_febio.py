@@ -14,7 +14,6 @@ from mvest.exchange.exporting.febio import (
     model_of_case,
     valve_document,
 )
-from mvest.exchange.febio.document import febio_mesh
 from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.valve_system import build_system
 from tests.cases.folders import template_case, tree_case
@@ -100,7 +99,7 @@ def test_branching_chordae_pull_as_the_cables(tmp_path):
     target = valve_document(model, np.zeros(0), options).write(tmp_path / "trees.feb")
     root = Xml.parse(target).getroot()
     start = rows(root.findall("Mesh/Nodes/node"))
-    mesh = febio_mesh(model.mesh)
+    mesh = model.mesh
     system = build_system(model.valve, model.contact_valve, mesh, model.settings, model.fixed)
     n, x = len(mesh.nodes), start.copy()
     x[:n] = mesh.nodes + np.array([0.0, 0.3, 3.0])  # the chordae are taut

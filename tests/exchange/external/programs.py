@@ -35,7 +35,11 @@ else:
             csv.writer(stream).writerows(table)
     answer = {"status": "converged", "reason": ""}
 answer |= {"format": "mvest-external", "version": 1}
+if how == ["refuse"]:
+    answer |= {"status": "failed", "reason": "material data missing in deck"}
 (folder / "response.json").write_text(json.dumps(answer))
+if how == ["refuse"]:
+    sys.exit(1)
 '''
 
 NAMES = ("k1", "k2")

@@ -12,7 +12,7 @@ import pytest
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import Gaussian, IteratedFilter, Reason
 from mvest.exchange.external.contract import Command
-from mvest.exchange.external.model import Differences, ProcessModel
+from mvest.exchange.external.model import ProcessModel
 from tests.exchange.external.programs import NAMES, SPRINGS, model, springs
 
 M = np.array([0.8, 2.5])
@@ -24,14 +24,14 @@ def ran(folder) -> int:
 
 
 def test_derivatives_of_the_program_are_used(tmp_path):
-    program = model(tmp_path, "exact", differences=None)
+    program = model(tmp_path, "exact", differences=False)
     prediction = program(M)
     y, jacobian = springs(*M)
     assert prediction.converged, prediction.reason
     np.testing.assert_allclose(prediction.y, y, rtol=1e-15)
     np.testing.assert_allclose(prediction.jacobian, jacobian, rtol=1e-15)
     assert (program.runs, program.own_jacobian, ran(tmp_path)) == (1, True, 1)
-    missing = model(tmp_path, differences=None)(M)
+    missing = model(tmp_path, differences=False)(M)
     assert "jacobian.csv is missing" in missing.reason
 
 
@@ -40,7 +40,7 @@ def test_differences_have_second_order_errors(tmp_path, processes):
     # 2/k expanded: central differences err by d^2 f'''/6 = (s k)^2 (12 / k^4) / 6, relative to f'
     # that is s^2.
     _, jacobian = springs(*M)
-    program = model(tmp_path, differences=Differences(0.02, processes=processes))
+    program = model(tmp_path, relative_step=0.02, processes=processes)
     found = program(M).jacobian
     relative = (found - jacobian)[jacobian != 0] / jacobian[jacobian != 0]
     np.testing.assert_allclose(relative, 0.02**2, rtol=0.03)
@@ -66,7 +66,7 @@ def test_an_interrupted_study_stops_its_programs(tmp_path):
     sleep = f"open({str(begun)!r} + '/' + str(os.getpid()), 'w'); time.sleep(60)"
     slow = f"import os\nif not data['jacobian']: {sleep}\n"
     source = SPRINGS.replace("folder = pathlib", slow + "folder = pathlib", 1)
-    program = model(tmp_path, source=source, limit=60, differences=Differences(processes=2))
+    program = model(tmp_path, source=source, limit=60, processes=2)
 
     def interrupt():
         while len([*begun.iterdir()]) < 2:
@@ -86,6 +86,7 @@ def test_an_interrupted_study_stops_its_programs(tmp_path):
     ("how", "message"),
     [
         ("crash", "exit status 1; its last words: out of licences"),
+        ("refuse", "exit status 1; material data missing in deck"),
         ("sleep", "stopped at the time limit of 0.5 s"),
     ],
 )
@@ -106,17 +107,14 @@ def test_the_filter_reports_why_the_program_failed(tmp_path):
     assert found.reason is Reason.MODEL_FAILED
     assert "expected > 0" in found.detail
     # The model converges at m, but not at its lower neighbour.
-    near_zero = model(tmp_path, differences=Differences(floor=1.0))(np.array([1e-4, 2.0]))
+    near_zero = model(tmp_path, floor=1.0)(np.array([1e-4, 2.0]))
     assert near_zero.reason.startswith("run for a difference at k1 = -0.0009, k2 = 2: run-")
 
 
-def test_a_parameter_of_zero_needs_a_floor():
-    with pytest.raises(InputError, match="parameter 1 is 0"):
-        Differences().neighbours(np.array([1.0, 0.0]))
-    found = Differences(0.1, floor=2.0).neighbours(np.array([3.0, 0.0]))
-    np.testing.assert_allclose(found, [[3.3, 0.0], [3.0, 0.2], [2.7, 0.0], [3.0, -0.2]])
-    with pytest.raises(ConfigurationError, match="relative_step"):
-        Differences(relative_step=0.0)
+def test_a_parameter_of_zero_needs_a_floor(tmp_path):
+    program = model(tmp_path)
+    assert program.by_differences(np.array([1.0, 0.0])).startswith("parameter 1 is 0, and so is")
+    assert program.runs == 0
 
 
 def test_invalid_models_are_refused_before_anything_runs(tmp_path):

@@ -9,18 +9,21 @@ import os
 import re
 import shutil
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from mvest.errors import ConfigurationError
-from mvest.exchange.febio.document import FebDocument, febio_mesh, positions_file
+from mvest.exchange.febio.document import NAMES, FebDocument, positions_file
 from mvest.processes import run
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 VARIABLE = "MVEST_FEBIO"
+
+UPRIGHT = {"hex18": "hex27", "wedge12": "wedge18"}
+"""Elements that need extra nodes halfway through the thickness."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +53,29 @@ def febio_program() -> Path:
             f"the variable {VARIABLE} (febio.org)"
         )
     return Path(found)
+
+
+def febio_mesh(mesh: SolidMesh) -> SolidMesh:
+    """The mesh of FEBio's elements; the nodes of ``mesh`` come first.
+
+    Elements with two layers of nodes get a third one halfway between them.
+    """
+    if mesh.element_type in NAMES:
+        return mesh
+    half = mesh.reference.n_nodes // 2
+    low, high = mesh.elements[:, :half], mesh.elements[:, half:]
+    pairs, number = np.unique(
+        np.stack([low, high], axis=-1).reshape(-1, 2), axis=0, return_inverse=True
+    )
+    fibre = mesh.fibre[:, :half] + mesh.fibre[:, half:]
+    fibre /= np.linalg.norm(fibre, axis=2, keepdims=True)
+    return replace(
+        mesh,
+        nodes=np.vstack([mesh.nodes, mesh.nodes[pairs].mean(axis=1)]),
+        elements=np.hstack([low, len(mesh.nodes) + number.reshape(low.shape), high]),
+        element_type=UPRIGHT[mesh.element_type],
+        fibre=np.concatenate([mesh.fibre[:, :half], fibre, mesh.fibre[:, half:]], axis=1),
+    )
 
 
 def restored(mesh: SolidMesh, x: FloatArray) -> FloatArray:

@@ -9,10 +9,11 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 import pytest
 
-from mvest.exchange.febio.document import FebDocument, febio_law, febio_mesh, opposite_faces
+from mvest.exchange.febio.document import FebDocument, febio_law, opposite_faces
 from mvest.mechanics.body import box, outer_faces
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.valve.mesh.solid_mesh import SolidMesh
+from tests.exchange.febio.program import febio_mesh
 
 # Where FEBio's shape functions of hex27 are one, from FESolidElementShape.cpp: a factor 0.5 r (r+1)
 # is one at r = 1, 0.5 r (r-1) at r = -1 and 1 - r^2 at r = 0.

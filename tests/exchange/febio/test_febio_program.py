@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from mvest.errors import ConfigurationError
-from mvest.exchange.febio.document import FebDocument, febio_law, febio_mesh
+from mvest.exchange.febio.document import FebDocument, febio_law
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.law import Law
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import NewtonSettings
-from tests.exchange.febio.program import febio_program, run_febio
+from tests.exchange.febio.program import febio_mesh, febio_program, run_febio
 from tests.exchange.febio.test_febio_mesh import mesh_of
 from tests.mechanics.bodies import SaintVenantKirchhoff
 

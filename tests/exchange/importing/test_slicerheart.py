@@ -10,9 +10,8 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.importing.chord_lines import MARGINAL_MM
 from mvest.exchange.importing.joining import _curled, _without_chords
-from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
+from mvest.exchange.importing.slicerheart import MARGINAL_MM, SlicerheartOptions, import_slicerheart
 from mvest.simulation.arrival import POSE, SHIFT, ArrivalSettings, arrive
 from mvest.valve.anatomy.valve import band_grid
 from mvest.valve.geometry.proximity import closest_points
