@@ -76,6 +76,13 @@ def test_what_a_page_names_exists(page):
         assert resolves(name), name
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_no_line_of_a_page_is_a_comment(page):
+    # MyST hides a line that begins with a percent sign, as a wrapped number may leave it.
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if line.lstrip().startswith("%")] == []
+
+
 def resolves(name):
     """Whether a dotted name is a module or something in one."""
     try:
