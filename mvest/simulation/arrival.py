@@ -2,7 +2,7 @@
 
 The valve is exported (as surfaces, as a folder of SlicerHeart, as label maps) and imported again.
 No reader or writer of this project takes part in the exports: VTK (through PyVista) cuts and writes
-surfaces, pandas tables, nibabel label maps.
+surfaces, pandas tables, nibabel label maps (their importer does not use surfaces).
 """
 
 from collections.abc import Sequence
@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
@@ -22,11 +20,11 @@ from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slic
 from mvest.exchange.importing.written import FoundFrame, case_of_frames
 from mvest.problem.registration import displace
 from mvest.quantities import Length
-from mvest.typing import FloatArray
+from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.geometry.leaflet_fields import inside_surfaces
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.thickening import smooth_vertex_normals
-from mvest.valve.geometry.triangles import unit_rows
 
 KINDS = ("vertices", "surfaces", "slicerheart", "labels")
 """Ways of exporting a geometry, in the order of tables."""
@@ -42,8 +40,7 @@ LANDMARKS = {
 }  # fmt: skip
 """Direction (x, y) of SlicerHeart's landmarks from the middle of the template's annulus."""
 
-FINE_MM, MARGIN_MM = 0.2, 6.0
-"""Spacing and margin of the grid on which leaflets are drawn before they are sampled at voxels."""
+Shape = Frame | LeafletSurface
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,58 +217,38 @@ def _write_points(file: Path, points: Sequence[FloatArray]) -> None:
     file.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")
 
 
-def _write_label_map(file: Path, frame: Frame, thickness_mm: FloatArray, voxel_mm: float) -> None:
+def _write_label_map(file: Path, frame: Shape, thickness_mm: FloatArray, voxel_mm: float) -> None:
     """Write thick leaflets (LPS mm) as a NIfTI of labels: 1 anterior, 2 posterior, 0 elsewhere.
 
-    A voxel belongs to the leaflets if more than half of it does, and to the one with more of it.
+    A voxel has the label of the leaflet in which its centre lies.
     """
     import nibabel
 
-    drawn, low = drawn_leaflets(frame, thickness_mm)
-    shape = [int(np.ceil(n * FINE_MM / voxel_mm)) for n in drawn.shape]
-    # The grid is not aligned with the leaflets.
-    start = 0.37 * voxel_mm
-    at = np.indices(shape).reshape(3, -1) * voxel_mm / FINE_MM + start / FINE_MM
-    share = []
-    for label in (1, 2):
-        # Approximate mean over a voxel: a normal distribution with the variance of its side.
-        blurred = gaussian_filter((drawn == label).astype(np.float32), voxel_mm / FINE_MM / 12**0.5)
-        share.append(map_coordinates(blurred, at, order=1).reshape(shape))
-    anterior, posterior = share
-    labels = np.where(anterior + posterior > 0.5, 1 + (posterior > anterior), 0)
+    leaflets = [_thick_leaflet(frame, label, thickness_mm) for label in (0, 1)]
+    (anterior, posterior), low = inside_surfaces(leaflets, voxel_mm)
+    labels = np.where(anterior, 1, np.where(posterior, 2, 0)).astype(np.uint8)
     # Axes of NIfTI are R, A, S.
     turned = np.array([-1.0, -1.0, 1.0])
     affine = np.diag([*(turned * voxel_mm), 1.0])
-    affine[:3, 3] = turned * (low + start)
+    affine[:3, 3] = turned * low
     image: Any = nibabel.Nifti1Image  # its constructor has no types
-    nibabel.save(image(labels.astype(np.uint8), affine), file)
+    nibabel.save(image(labels, affine), file)
 
 
-def drawn_leaflets(
-    frame: Frame | LeafletSurface, thickness_mm: FloatArray
-) -> tuple[NDArray[np.uint8], FloatArray]:
-    """Labels on a fine grid, and the position of its first point (LPS mm)."""
-    vertices, triangles = frame.vertices.copy(), frame.triangles
-    normals = smooth_vertex_normals(vertices, triangles)
-    # Points are drawn as cells of the fine grid, which reach half a cell beyond them.
-    for loop in boundary_loops(triangles):
-        along = np.roll(vertices[loop], -1, axis=0) - np.roll(vertices[loop], 1, axis=0)
-        vertices[loop] += 0.5 * FINE_MM * unit_rows(np.cross(normals[loop], along))
-    corner = vertices[triangles]
-    longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max()
-    k = int(np.ceil(longest / (0.8 * FINE_MM)))
-    i, j = np.meshgrid(np.arange(k + 1), np.arange(k + 1))
-    inside = i + j <= k
-    weights = np.column_stack([i[inside], j[inside], k - i[inside] - j[inside]]) / k
-    points = np.einsum("ka,tai->tki", weights, corner).reshape(-1, 3)
-    along = np.einsum("ka,tai->tki", weights, normals[triangles]).reshape(-1, 3)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    reach = np.einsum("ka,ta->tk", weights, thickness_mm[triangles]).ravel() - FINE_MM
-    leaflet = np.repeat(frame.region + 1, len(weights)).astype(np.uint8)
-    low = vertices.min(axis=0) - MARGIN_MM
-    shape = np.ceil((np.ptp(vertices, axis=0) + 2 * MARGIN_MM) / FINE_MM).astype(int) + 1
-    drawn: NDArray[np.uint8] = np.zeros(shape, dtype=np.uint8)
-    for zeta in np.linspace(-0.5, 0.5, int(np.ceil(thickness_mm.max() / (0.8 * FINE_MM))) + 1):
-        cell = np.round((points + zeta * reach[:, None] * along - low) / FINE_MM).astype(int)
-        drawn[tuple(cell.T)] = leaflet
-    return drawn, low
+def _thick_leaflet(
+    frame: Shape, label: int, thickness_mm: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Vertices mm and triangles of one leaflet's closed surface, normals outwards.
+
+    Leaflets in contact may pass through each other by the tolerance of contact, so each is closed
+    on its own, as `mvest.valve.geometry.thickening.thicken` does with both.
+    """
+    offset = 0.5 * thickness_mm[:, None] * smooth_vertex_normals(frame.vertices, frame.triangles)
+    own, numbers = np.unique(frame.triangles[frame.region == label], return_inverse=True)
+    triangles, n = numbers.reshape(-1, 3), len(own)
+    sides = [triangles, triangles[:, ::-1] + n]
+    for a in boundary_loops(triangles):
+        b = np.roll(a, -1)
+        sides += [np.column_stack([b, a, a + n]), np.column_stack([b, a + n, b + n])]
+    middle = frame.vertices[own]
+    return np.concatenate([middle + offset[own], middle - offset[own]]), np.concatenate(sides)

@@ -19,9 +19,14 @@ from skimage import measure
 
 from mvest.errors import GeometryError
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.anatomy.valve import vertex_normals
-from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.triangles import connected_pieces, euler_number, surface_edges
+from mvest.valve.geometry.proximity import ClosestPoints, closest_points
+from mvest.valve.geometry.triangles import (
+    connected_pieces,
+    edge_table,
+    euler_number,
+    surface_edges,
+    unit_normals,
+)
 
 # skimage has no type hints.
 marching_cubes: Any = measure.marching_cubes
@@ -178,7 +183,8 @@ def inside_surfaces(
 ) -> tuple[list[BoolArray], FloatArray]:
     """Find the points of a common grid inside each of several closed surfaces.
 
-    Near a surface, the normal at the closest point decides; holes are then filled.
+    Near a surface, the normal at the closest point decides (`_signed_normals`); holes are then
+    filled.
 
     Parameters
     ----------
@@ -210,11 +216,38 @@ def inside_surfaces(
         close = np.flatnonzero(np.isfinite(near))
         nearest = closest_points(grid[close], vertices, triangles)
         foot = nearest.interpolate(vertices, triangles)
-        normal = nearest.interpolate(vertex_normals(vertices, triangles), triangles)
+        normal = _signed_normals(nearest, vertices, triangles)
         inside = np.zeros(len(grid), dtype=np.bool_)
         inside[close] = np.einsum("ij,ij->i", grid[close] - foot, normal) < 0
         masks.append(np.asarray(ndimage.binary_fill_holes(inside.reshape(shape))))
     return masks, low
+
+
+def _signed_normals(found: ClosestPoints, vertices: FloatArray, triangles: IntArray) -> FloatArray:
+    """Normals ``(k, 3)`` at closest points, also at those on an edge or a vertex of the surface.
+
+    Points from which they point away are inside, however sharp the edges are: the sum of an edge's
+    two normals, and the sum of a vertex's, weighted by the angles of its triangles (Baerentzen and
+    Aanaes 2005, IEEE Trans. Vis. Comput. Graph. 11:243).
+    """
+    face = unit_normals(vertices, triangles)
+    _, edges, number, _ = edge_table(triangles)
+    at_edge, at_vertex = np.zeros((len(edges), 3)), np.zeros_like(vertices)
+    np.add.at(at_edge, number, np.repeat(face, 3, axis=0))
+    corner = vertices[triangles]
+    along = np.roll(corner, -1, axis=1) - corner
+    along /= np.linalg.norm(along, axis=2, keepdims=True)
+    angle = np.arccos(np.clip(-np.sum(along * np.roll(along, 1, axis=1), axis=2), -1, 1))
+    np.add.at(at_vertex, triangles, angle[..., None] * face[:, None])
+
+    normal = face[found.triangle]
+    away = found.barycentric == 0
+    on_edge, on_vertex = (away.sum(axis=1) == n for n in (1, 2))
+    opposite = 3 * found.triangle[on_edge] + (away[on_edge].argmax(axis=1) + 1) % 3
+    normal[on_edge] = at_edge[number[opposite]]
+    own = triangles[found.triangle[on_vertex], away[on_vertex].argmin(axis=1)]
+    normal[on_vertex] = at_vertex[own]
+    return normal
 
 
 def thick_leaflets(

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from matplotlib.path import Path as MplPath
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from mvest.valve.geometry.leaflet_fields import fields_of_masks
+from mvest.valve.geometry.leaflet_fields import fields_of_masks, inside_surfaces
 
 THICKNESS = 1.2
 """mm, of the plate |z| <= 0.6, |x| <= 9 and -9 <= y <= 0 in its own axes."""
@@ -58,3 +59,26 @@ def test_walls_and_rims_are_where_they_are(voxel):
     assert np.mean(ends) + lost == pytest.approx(0.0, abs=voxel / 8)
     # Of coarse voxels the rim is lost, by twice as much.
     assert (lost > voxel / 4) is (voxel > 0.6)
+
+
+def test_a_point_beside_a_sharp_edge_is_outside():
+    """With area-weighted normals, some points beside the rims of a bent plate count as inside."""
+    angle, n = np.linspace(0.0, 2.0, 5), 5
+    arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    profile = np.concatenate([5.4 * arc, 4.6 * arc[::-1]])
+    k, m = np.arange(2 * n), 2 * n
+    sides = np.concatenate(
+        [
+            np.stack([k, np.roll(k, -1), k + m], axis=1),
+            np.stack([np.roll(k, -1), np.roll(k, -1) + m, k + m], axis=1),
+        ]
+    )
+    a, b = np.arange(n - 1), m - 1 - np.arange(n - 1)
+    cap = np.concatenate([np.stack([a, b, a + 1], axis=1), np.stack([a + 1, b, b - 1], axis=1)])
+    triangles = np.concatenate([sides, cap, cap[:, ::-1] + m])
+    ends = [np.column_stack([profile, np.full(m, z)]) for z in (-3.0, 3.0)]
+    turn = Rotation.from_euler("zyx", [0.5, 0.4, 0.3]).as_matrix()
+    (inside,), low = inside_surfaces([(np.concatenate(ends) @ turn.T, triangles)], 0.13)
+    points = (low + 0.13 * np.argwhere(np.ones_like(inside))) @ turn
+    expected = MplPath(profile).contains_points(points[:, :2]) & (np.abs(points[:, 2]) < 3.0)
+    np.testing.assert_array_equal(inside.ravel(), expected)
