@@ -49,7 +49,9 @@ def check(path: Path, **given: Any) -> ValveCase:
     assert np.sqrt(np.mean(away.distance**2)) < 0.25
     centres = surface.vertices[surface.triangles].mean(axis=1)
     nearest = closest_points(centres, TRUE.vertices, TRUE.triangles)
-    assert (TRUE.region[nearest.triangle] == surface.region).mean() > 0.95
+    # Each commissure is found within one column of vertices.
+    wrong = (TRUE.region[nearest.triangle] != surface.region).mean()
+    assert wrong < 2.01 / len(found.annulus)
     return found
 
 

@@ -24,8 +24,9 @@ COLUMNS, ROWS = 96, 15
 def small_valve(closed: bool, taller: float = 0.0) -> LeafletSurface:
     """A tube; closed, its leaflets touch all along but for a pocket beside each commissure.
 
+    It narrows from commissure to commissure, so that its free edge encloses less than its annulus.
     The middle of the anterior leaflet is taller by a share of its height, that of the posterior
-    one by half of it; the tube narrows then.
+    one by half of it; the tube narrows between the leaflets as well then.
     """
     grid = band_grid(COLUMNS, ROWS)
     turn = np.radians(grid.phi)
@@ -40,8 +41,10 @@ def small_valve(closed: bool, taller: float = 0.0) -> LeafletSurface:
     share = np.clip(depth / TOUCHING_FROM, 0, 1) if closed else np.zeros_like(depth)
     away = (1 - share) * open_at + share * touching
     points = np.stack([HALF_LENGTH * np.cos(turn), np.sign(np.sin(turn)) * away, -depth], axis=1)
+    narrowing = 1 - 0.15 * grid.s
+    points[:, 0] *= narrowing
     if taller:
-        points[:, :2] *= (1 - 0.15 * grid.s)[:, None]
+        points[:, 1] *= narrowing
     return LeafletSurface(
         points,
         grid.triangles,
