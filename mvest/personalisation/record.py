@@ -219,6 +219,7 @@ def arrays_of_case(fit: Personalised) -> dict[str, Any]:
     arrays: dict[str, Any] = {
         "triangles": surface.triangles,
         "region": surface.region,
+        "leaflets": list(surface.region_names),
         "rest": surface.vertices,
         "annulus": case.annulus,
         "free_edge": case.free_edge,

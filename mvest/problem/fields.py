@@ -45,6 +45,7 @@ class CaseFields:
     tips: FloatArray  #: (f + 1, t, 3) mm, papillary tips, in the reference frame first
     #: ``(q, 3)`` mm for a frame without correspondence to the reference frame.
     observed_points: Mapping[str, FloatArray]
+    leaflets: tuple[str, ...] = ()  #: names of the regions, in the order of their numbers
     free_edge: IntArray = field(default_factory=lambda: NO_INDEX)  #: (k,), vertices in loop order
     chord_tip: IntArray = field(default_factory=lambda: NO_INDEX)  #: (k,), of the chords' segments
     #: ``(c,)`` vertices at the leaflet ends, or ``(k,)`` if the junctions are points too
@@ -130,6 +131,7 @@ def valve_fields(valve: Valve, frames: Sequence[str]) -> dict[str, NDArray[Any]]
         {
             "triangles": surface.triangles,
             "region": surface.region,
+            "leaflets": list(surface.region_names),
             "rest": surface.vertices,
             "annulus": valve.annulus,
             "free_edge": valve.free_edge,
@@ -164,6 +166,7 @@ def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> Cas
             if name in arrays or name in NEEDED
         }
         frames = tuple(map(str, arrays["frames"]))
+        leaflets = tuple(map(str, arrays.get("leaflets", ())))
         values.setdefault("tips", np.empty((len(frames) + 1, 0, 3)))
         points = {
             name.removeprefix(POINTS): np.asarray(array, dtype=np.float64)
@@ -171,7 +174,9 @@ def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> Cas
             if name.startswith(POINTS)
         }
         reach = float(arrays["reach_mm"]) if "reach_mm" in arrays else None
-        fields = CaseFields(frames=frames, observed_points=points, reach_mm=reach, **values)
+        fields = CaseFields(
+            frames=frames, leaflets=leaflets, observed_points=points, reach_mm=reach, **values
+        )
         if not turned:
             return fields
         middle, axes = turn_of(

@@ -22,8 +22,6 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import principal_stretches
 
 FIELDS = "fields.npz"
-REGIONS = ("anterior", "posterior")
-"""Region names for a run, which stores only their numbers."""
 MUSCLES = ("antero-lateral", "postero-medial")
 
 
@@ -62,6 +60,8 @@ def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:
     if "times" in read_npz(source / FIELDS):
         return write_atomically(target, lambda part: _write_closing(part, source / FIELDS))
     fields = case_fields(source / FIELDS, turned=False)
+    if not fields.leaflets:
+        raise InputError(f"{source / FIELDS}: no names of leaflets; run the case again")
     return write_atomically(target, lambda part: _write_run(part, fields))
 
 
@@ -82,8 +82,7 @@ def _write_case(folder: Path, case: ValveCase) -> None:
 
 def _write_run(folder: Path, fields: CaseFields) -> None:
     folder.mkdir()
-    count = int(fields.region.max(initial=0)) + 1
-    names = REGIONS if count == 2 else tuple(f"leaflet {k + 1}" for k in range(count))
+    names = fields.leaflets
     cells = region_arrays(fields.region, names)
     for name in ("observed", "generic", "fitted"):
         moved = getattr(fields, name)
@@ -109,7 +108,7 @@ def _write_closing(folder: Path, file: Path) -> None:
         arrays = read_npz(file)
         shapes = np.asarray(arrays["frames"], dtype=np.float64)
         triangles, region = (np.asarray(arrays[k], np.int64) for k in ("triangles", "region"))
-        cells = region_arrays(region, REGIONS[: int(region.max()) + 1])
+        cells = region_arrays(region, tuple(map(str, arrays["leaflets"])))
         states = []
         for k, points in enumerate(shapes):
             data = {"displacement_mm": points - shapes[0]}

@@ -94,6 +94,7 @@ def test_a_run_is_written_with_its_distances(tmp_path):
     arrays |= {"frames": np.array(["closed"]), "observed": closed.vertices[None]}
     arrays["tips"] = np.stack([one.papillary_tips for one in (CASE.frames[0], closed)])
     arrays |= {"fitted": rest[None] * [1.2, 1, 1], "distance_fitted": np.full((1, len(rest)), 0.25)}
+    arrays["leaflets"] = np.array(["posterior", "anterior"])
     (tmp_path / "run").mkdir()
     np.savez(tmp_path / "run" / "fields.npz", **arrays)
     out = export_slicer(tmp_path / "run", tmp_path / "out", SlicerOptions())
@@ -105,6 +106,13 @@ def test_a_run_is_written_with_its_distances(tmp_path):
     assert first["stretch_largest"] == pytest.approx(1.0)
     assert last["stretch_largest"].max() == pytest.approx(1.2, abs=1e-3)
     assert (out / "closed.mrk.json").is_file()
+    # Regions have the names of the case, whose order is its own.
+    cells = arrays_of(read(out / "fitted_0000.vtp").GetCellData())
+    assert np.array_equal(cells["region.anterior"], surface.region == 1)
+    del arrays["leaflets"]
+    np.savez(tmp_path / "run" / "fields.npz", **arrays)
+    with pytest.raises(InputError, match="no names of leaflets; run the case again"):
+        export_slicer(tmp_path / "run", tmp_path / "again", SlicerOptions())
 
 
 def test_a_closure_is_written_with_stress_and_contact_pressure(tmp_path):
@@ -115,6 +123,7 @@ def test_a_closure_is_written_with_stress_and_contact_pressure(tmp_path):
     (tmp_path / "run").mkdir()
     arrays = {"times": times, "frames": frames, "region": surface.region}
     arrays |= {"triangles": surface.triangles, "stress": stress, "contact_pressure": 2 * stress}
+    arrays["leaflets"] = np.array(["front", "left", "right"])
     np.savez(tmp_path / "run" / "fields.npz", **arrays)
     out = export_slicer(tmp_path / "run", tmp_path / "out", SlicerOptions())
     entries = ET.parse(out / "closing.pvd").findall("Collection/DataSet")
@@ -122,6 +131,8 @@ def test_a_closure_is_written_with_stress_and_contact_pressure(tmp_path):
     last = arrays_of(read(out / "closing_0002.vtp").GetPointData())
     assert (last["stress_MPa"] == 0.05).all()
     assert (last["contact_pressure_MPa"] == 0.1).all()
+    cells = arrays_of(read(out / "closing_0002.vtp").GetCellData())
+    assert np.array_equal(cells["region.left"], surface.region == 1)
     assert last["displacement_mm"] == pytest.approx(np.full_like(frames[0], 2.0) * [0, 0, 1])
 
 
