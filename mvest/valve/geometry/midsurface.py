@@ -19,10 +19,11 @@ from scipy.spatial.distance import cdist
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import band_grid
+from mvest.valve.anatomy.valve import band_grid, lumped_areas, vertex_normals
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import (
     SurfaceCoordinates,
+    cotangent_laplacian,
     surface_coordinates,
     wrapped,
 )
@@ -86,6 +87,24 @@ class Midsurface:
         outwards = grid[[0, -1]] - grid[[1, -2]]
         grid[[0, -1]] += by_mm[..., None] * outwards / np.linalg.norm(outwards, axis=2)[..., None]
         return replace(self, vertices=grid.reshape(-1, 3))
+
+    def unblurred(self, blur_mm: float) -> Midsurface:
+        """The surface before a Gaussian blur of its tissue, to first order.
+
+        The blur has moved it towards its centres of curvature by ``blur^2 / 2`` times the sum of
+        its principal curvatures (`mvest.valve.geometry.segmented.segmentation_std`), which is its
+        Laplacian along the normal; edges, by their curvature as space curves.
+        """
+        x, triangles = self.vertices, self.triangles
+        normals = vertex_normals(x, triangles)
+        outwards = cotangent_laplacian(x, triangles) @ x / lumped_areas(x, triangles)[:, None]
+        away = normals * np.sum(outwards * normals, axis=1, keepdims=True)
+        for edge in (self.annulus, self.free_edge):
+            ahead = np.roll(x[edge], -1, axis=0) - x[edge]
+            length = np.linalg.norm(ahead, axis=1, keepdims=True)
+            turn = ahead / length - np.roll(ahead / length, 1, axis=0)
+            away[edge] = -2 * turn / (length + np.roll(length, 1, axis=0))
+        return replace(self, vertices=x + 0.5 * blur_mm**2 * away)
 
     def smoothed(self, width_mm: float) -> tuple[Midsurface, float]:
         """Smooth the surface around the valve; also return the largest move (mm) of a vertex.

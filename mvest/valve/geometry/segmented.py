@@ -79,7 +79,7 @@ def masks_midsurface(
     )
     thickness = fields.true_thickness(surface.thickness - 2 * solid.grown_mm)
     rims = thickness.reshape(-1, len(surface.annulus))[[0, -1]]
-    surface = surface.extended(fields.lost_rim(rims) - solid.grown_mm)
+    surface = surface.extended(fields.lost_rim(rims) - solid.grown_mm).unblurred(fields.blur_mm)
     derived = (*solid.derived, *surface.derived)
     return replace(surface, thickness=thickness, derived=derived), solid.seams
 
