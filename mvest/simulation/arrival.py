@@ -2,7 +2,8 @@
 
 The valve is exported (as surfaces, as a folder of SlicerHeart, as label maps) and imported again.
 No reader or writer of this project takes part in the exports: VTK (through PyVista) cuts and writes
-surfaces, pandas tables, nibabel label maps (their importer does not use surfaces).
+surfaces, pandas tables, nibabel label maps. Voxels are those inside closed surfaces, found by a
+function that the importer of label maps does not use.
 """
 
 from collections.abc import Sequence

@@ -145,7 +145,8 @@ def segmentation_std(voxel_mm: float, blur_mm: float, observer_mm: float) -> flo
     A wall is uniformly distributed within a voxel (standard deviation ``voxel / sqrt(12)``), and
     the midsurface is the mean of two walls. Gaussian smoothing of a signed distance moves a surface
     of curvature k by ``blur^2 k / 2`` (mean curvature flow: Merriman, Bence and Osher 1994, J.
-    Comput. Phys. 112:334). The observer's error is added.
+    Comput. Phys. 112:334). `Midsurface.unblurred` undoes this to first order; it is still
+    counted, for bends that voxels do not resolve. The observer's error is added.
     """
     return float(np.sqrt(voxel_mm**2 / 24 + (blur_mm**2 / (2 * BEND_MM)) ** 2 + observer_mm**2))
 
