@@ -174,9 +174,9 @@ class PredictedSurface:
         """Number n of vertices that the model predicts in each frame."""
         return int(self.weights.shape[1])
 
-    def drawn(self, predicted: FloatArray, some: IntArray | slice = slice(None)) -> FloatArray:
-        """Values at the refined vertices, or some of them, from the predicted ones ``(n, ...)``."""
-        flat = self.weights[some] @ predicted.reshape(len(predicted), -1)
+    def drawn(self, predicted: FloatArray) -> FloatArray:
+        """Values at the refined vertices from the predicted ones ``(n, ...)``."""
+        flat = self.weights @ predicted.reshape(len(predicted), -1)
         return np.asarray(flat).reshape(flat.shape[0], *predicted.shape[1:])
 
     def leaflet_along(self, loop: IntArray) -> IntArray:
@@ -294,12 +294,11 @@ class SurfaceObservation:
     ) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Distances in a frame to the predicted surface, and their derivatives."""
         surface, kept = self.surface, seen.compared
-        drawn = surface.drawn(vertices)
+        drawn, moved = surface.drawn(vertices), surface.drawn(motion)
         h, H = np.empty(len(seen.points)), np.empty((len(seen.points), motion.shape[-1]))
         for region, own in seen.by_region():
             points, triangles = seen.points[own], surface.leaflet(region)
-            h[own], slopes = smooth_distances(points, drawn, triangles, surface.width)
-            H[own] = sum(slope @ surface.weights @ motion[:, k] for k, slope in enumerate(slopes))
+            h[own], H[own] = smooth_distances(points, drawn, moved, triangles, surface.width)
         yield h, H
         if seen.free_edge is None or surface.free_edge is None or not kept.any():
             return
@@ -308,8 +307,7 @@ class SurfaceObservation:
         same = None
         if seen.free_edge_region is not None:
             same = seen.free_edge_region[kept, None] == surface.leaflet_along(loop)
-        moved = surface.drawn(motion, loop)
-        yield smooth_offsets(curve[kept], across, drawn[loop], moved, surface.width, same)
+        yield smooth_offsets(curve[kept], across, drawn[loop], moved[loop], surface.width, same)
 
     def _noise(self) -> NoiseCovariance:
         parts, length = [], self.correlation_length_mm

@@ -6,11 +6,11 @@ to its true posterior.
 """
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
+from numba import njit
 
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.geometry.triangles import area_vectors
+from mvest.valve.geometry.proximity import dot, minus, row
+from mvest.valve.geometry.triangles import area_vectors, area_vectors_change
 
 TANGENT_REACH = 6.0
 """Distance to each side over which a curve's direction is measured, in standard deviations of its
@@ -22,8 +22,12 @@ REACH = 5.5
 
 
 def smooth_distances(
-    points: FloatArray, vertices: FloatArray, triangles: IntArray, width: float
-) -> tuple[FloatArray, list[csr_array]]:
+    points: FloatArray,
+    vertices: FloatArray,
+    motion: FloatArray,
+    triangles: IntArray,
+    width: float,
+) -> tuple[FloatArray, FloatArray]:
     """Signed distances from points to a surface smoothed over a width, and their derivatives.
 
     Triangles with area vectors a and middles p have the weights ``g = exp(-|x - p|² / 2 w²)``::
@@ -38,6 +42,8 @@ def smooth_distances(
     ----------
     points : (q, 3) mm
     vertices : (n, 3) mm
+    motion : (n, 3, p)
+        Derivatives of the vertices with respect to p parameters.
     triangles : (m, 3)
         Consistently oriented, not larger than the width.
     width : float
@@ -47,33 +53,56 @@ def smooth_distances(
     -------
     distance : (q,) mm
         Positive on the side of the normals.
-    derivative : list of three (q, n) sparse
-        With respect to the x, y and z of the vertices.
+    derivative : (q, p)
     """
-    corner = vertices[triangles]
-    middle, area = corner.mean(axis=1), area_vectors(vertices, triangles)
-    tree = cKDTree(middle)
-    nearest = np.asarray(tree.query(points)[0])
-    near = tree.query_ball_point(points, np.hypot(nearest, REACH * width))
-    row = np.repeat(np.arange(len(points)), [len(each) for each in near])
-    of = np.concatenate([np.asarray(each, dtype=np.int64) for each in near])
+    middle, area = vertices[triangles].mean(axis=1), area_vectors(vertices, triangles)
+    slid, turned = motion[triangles].mean(axis=1), area_vectors_change(vertices, triangles, motion)
+    return _smoothed(points, middle, area, width, slid, turned)
 
-    def total(values: FloatArray) -> FloatArray:
-        return np.stack([np.bincount(row, column, len(points)) for column in values.T], axis=1)
 
-    away, a = points[row] - middle[of], area[of]
-    g = np.exp(0.5 * (nearest[row] ** 2 - np.einsum("ki,ki->k", away, away)) / width**2)
-    V = total(g[:, None] * a)
-    size = np.linalg.norm(V, axis=1)
-    distance = total((g * np.einsum("ki,ki->k", a, away))[:, None])[:, 0] / size
-    y = away - (distance / size)[row, None] * V[row]
-    opposite = np.roll(corner, -1, axis=1) - np.roll(corner, -2, axis=1)
-    turned = 0.5 * np.cross(opposite[of], y[:, None])
-    slid = (np.einsum("ki,ki->k", a, y) / width**2)[:, None] * away - a
-    by_corner = (g / size[row])[:, None, None] * (turned + slid[:, None] / 3.0)
-    place = np.repeat(row, 3), triangles[of].ravel()
-    shape = (len(points), len(vertices))
-    return distance, [csr_array((by_corner[..., k].ravel(), place), shape=shape) for k in range(3)]
+@njit(cache=True)
+def _smoothed(
+    points: FloatArray,
+    middle: FloatArray,
+    area: FloatArray,
+    width: float,
+    slid: FloatArray,
+    turned: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Distances ``(q,)`` and derivatives ``(q, p)``, with those of middles and area vectors."""
+    distance = np.empty(len(points))
+    derivative = np.zeros((len(points), slid.shape[2]))
+    squared, g = np.empty(len(middle)), np.empty(len(middle))
+    for i in range(len(points)):
+        x = row(points, i)
+        for t in range(len(middle)):
+            away = minus(x, row(middle, t))
+            squared[t] = dot(away, away)
+        nearest = squared.min()
+        reach = nearest + (REACH * width) ** 2
+        V0, V1, V2, total = 0.0, 0.0, 0.0, 0.0
+        for t in range(len(middle)):
+            g[t] = 0.0
+            if squared[t] <= reach:
+                g[t] = np.exp(0.5 * (nearest - squared[t]) / width**2)
+                a = row(area, t)
+                V0, V1, V2 = V0 + g[t] * a[0], V1 + g[t] * a[1], V2 + g[t] * a[2]
+                total += g[t] * dot(a, minus(x, row(middle, t)))
+        size = np.sqrt(V0**2 + V1**2 + V2**2)
+        distance[i] = total / size
+        foot = distance[i] / size
+        for t in range(len(middle)):
+            if g[t] == 0.0:
+                continue
+            a, away = row(area, t), minus(x, row(middle, t))
+            y = minus(away, (foot * V0, foot * V1, foot * V2))
+            weight, pulled = g[t] / size, dot(a, y) / width**2
+            for k in range(slid.shape[2]):
+                change = 0.0
+                for c in range(3):
+                    change += y[c] * turned[t, c, k] + (pulled * away[c] - a[c]) * slid[t, c, k]
+                derivative[i, k] += weight * change
+    return distance, derivative
 
 
 def across_curve(curve: FloatArray, std: float) -> FloatArray:

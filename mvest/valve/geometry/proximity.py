@@ -30,37 +30,39 @@ def row(points: FloatArray, i: int) -> Vector:
 
 
 @njit(cache=True)
-def _difference(a: Vector, b: Vector) -> Vector:
+def minus(a: Vector, b: Vector) -> Vector:
+    """The difference ``a - b``."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @njit(cache=True)
-def _dot(a: Vector, b: Vector) -> float:
+def dot(a: Vector, b: Vector) -> float:
+    """The scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True)
 def closest_on_triangle(p: Vector, a: Vector, b: Vector, c: Vector) -> Vector:
     """Barycentric coordinates ``(u, v, w)`` of the point of triangle ``abc`` closest to `p`."""
-    ab = _difference(b, a)
-    ac = _difference(c, a)
-    ap = _difference(p, a)
-    d1 = _dot(ab, ap)
-    d2 = _dot(ac, ap)
+    ab = minus(b, a)
+    ac = minus(c, a)
+    ap = minus(p, a)
+    d1 = dot(ab, ap)
+    d2 = dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:
         return 1.0, 0.0, 0.0
-    bp = _difference(p, b)
-    d3 = _dot(ab, bp)
-    d4 = _dot(ac, bp)
+    bp = minus(p, b)
+    d3 = dot(ab, bp)
+    d4 = dot(ac, bp)
     if d3 >= 0.0 and d4 <= d3:
         return 0.0, 1.0, 0.0
     vc = d1 * d4 - d3 * d2
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
         v = d1 / (d1 - d3)
         return 1.0 - v, v, 0.0
-    cp = _difference(p, c)
-    d5 = _dot(ab, cp)
-    d6 = _dot(ac, cp)
+    cp = minus(p, c)
+    d5 = dot(ab, cp)
+    d6 = dot(ac, cp)
     if d6 >= 0.0 and d5 <= d6:
         return 0.0, 0.0, 1.0
     vb = d5 * d2 - d1 * d6
