@@ -23,7 +23,7 @@ TRIALS = 4
 """Lengths of one damped step that are tried."""
 
 AS_PREDICTED = 0.75
-"""Share of the gain predicted to first order that ends the damping of a step."""
+"""Share of a trial's predicted gain that ends the damping of a step."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,10 @@ def damped_step(
 ) -> T | str:
     """The best point along a Gauss-Newton step, or why there is none.
 
-    The full step is taken where the first order holds; otherwise a parabola through the trials
-    gives the length, so that steps across a curved valley do not oscillate. Empty if the full step
-    was possible but nothing is better than the start.
+    The full step is taken where the first order holds; otherwise a parabola through the last trial
+    gives the next length, so that steps across a curved valley do not oscillate, until a trial
+    gains what its parabola predicts. Empty if the full step was possible but nothing is better than
+    the start.
 
     ``trial`` maps a share of the step to misfit and point there, or to the reason why there is
     none. The misfit is ``here`` at the start, and ``predicted`` lower after the full step to first
@@ -120,6 +121,7 @@ def damped_step(
     """
     best: T | None = None
     lowest, share, why = here, 1.0, ""
+    curvature = predicted
     for _ in range(TRIALS):
         found = trial(share)
         if isinstance(found, str):
@@ -128,7 +130,8 @@ def damped_step(
         value, there = found
         if value < lowest:
             best, lowest = there, value
-        if predicted <= 0.0 or here - value > AS_PREDICTED * share * (2.0 - share) * predicted:
+        promised = share * (2.0 * predicted - curvature * share)
+        if predicted <= 0.0 or here - value > max(0.0, AS_PREDICTED * promised):
             break
         # Positive, because the gain is at most three quarters of the predicted one.
         curvature = (value - here + 2.0 * share * predicted) / share**2

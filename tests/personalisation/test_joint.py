@@ -101,6 +101,10 @@ def test_a_step_is_damped_by_a_parabola_through_its_trials():
     assert damped_step(curved(3.0), 10.0, 3.0) == 1.0
     assert tried == [1.0]
     assert damped_step(curved(12.0), 10.0, 3.0) == 0.25
+    # The second trial gains what the parabola through the first predicts.
+    assert tried == [1.0, 1.0, 0.25]
+    # So curved that a fifth of the step, the shortest second trial, is worse than the start.
+    assert damped_step(curved(120.0), 10.0, 3.0) == pytest.approx(0.04)
     # A valve that does not close halves the step; nothing is better, and nothing closes.
     assert damped_step(lambda s: "torn" if s > 0.6 else (5.0, s), 10.0, 3.0) == 0.5
     assert damped_step(lambda share: (11.0, share), 10.0, -1.0) == ""

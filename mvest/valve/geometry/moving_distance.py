@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.geometry.proximity import dot, minus, row
-from mvest.valve.geometry.triangles import area_vectors, area_vectors_change
+from mvest.valve.geometry.proximity import cross, dot, minus, row
+from mvest.valve.geometry.triangles import area_vectors
 
 TANGENT_REACH = 6.0
 """Distance to each side over which a curve's direction is measured, in standard deviations of its
@@ -19,6 +19,9 @@ across it."""
 
 REACH = 5.5
 """Distance beyond the nearest triangle, in widths, at which weights (below 3e-7) are cut off."""
+
+AT_ONCE = 256
+"""Points whose derivatives with respect to all vertices are held in memory at once."""
 
 
 def smooth_distances(
@@ -55,54 +58,59 @@ def smooth_distances(
         Positive on the side of the normals.
     derivative : (q, p)
     """
+    distance, derivative = np.empty(len(points)), np.empty((len(points), motion.shape[2]))
     middle, area = vertices[triangles].mean(axis=1), area_vectors(vertices, triangles)
-    slid, turned = motion[triangles].mean(axis=1), area_vectors_change(vertices, triangles, motion)
-    return _smoothed(points, middle, area, width, slid, turned)
+    flat = motion.reshape(-1, motion.shape[2])
+    for first in range(0, len(points), AT_ONCE):
+        some = slice(first, first + AT_ONCE)
+        distance[some], slope = _smoothed(points[some], vertices, triangles, middle, area, width)
+        derivative[some] = slope.reshape(-1, len(flat)) @ flat
+    return distance, derivative
 
 
 @njit(cache=True)
 def _smoothed(
     points: FloatArray,
+    vertices: FloatArray,
+    triangles: IntArray,
     middle: FloatArray,
     area: FloatArray,
     width: float,
-    slid: FloatArray,
-    turned: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Distances ``(q,)`` and derivatives ``(q, p)``, with those of middles and area vectors."""
-    distance = np.empty(len(points))
-    derivative = np.zeros((len(points), slid.shape[2]))
-    squared, g = np.empty(len(middle)), np.empty(len(middle))
+    """Distances ``(q,)`` and their derivatives ``(q, n, 3)`` with respect to the vertices."""
+    distance, slope = np.empty(len(points)), np.zeros((len(points), len(vertices), 3))
+    squared, g = np.empty(len(triangles)), np.empty(len(triangles))
     for i in range(len(points)):
         x = row(points, i)
-        for t in range(len(middle)):
+        for t in range(len(triangles)):
             away = minus(x, row(middle, t))
             squared[t] = dot(away, away)
         nearest = squared.min()
         reach = nearest + (REACH * width) ** 2
         V0, V1, V2, total = 0.0, 0.0, 0.0, 0.0
-        for t in range(len(middle)):
+        for t in range(len(triangles)):
             g[t] = 0.0
             if squared[t] <= reach:
                 g[t] = np.exp(0.5 * (nearest - squared[t]) / width**2)
-                a = row(area, t)
-                V0, V1, V2 = V0 + g[t] * a[0], V1 + g[t] * a[1], V2 + g[t] * a[2]
-                total += g[t] * dot(a, minus(x, row(middle, t)))
+                n = row(area, t)
+                V0, V1, V2 = V0 + g[t] * n[0], V1 + g[t] * n[1], V2 + g[t] * n[2]
+                total += g[t] * dot(n, minus(x, row(middle, t)))
         size = np.sqrt(V0**2 + V1**2 + V2**2)
         distance[i] = total / size
         foot = distance[i] / size
-        for t in range(len(middle)):
+        for t in range(len(triangles)):
             if g[t] == 0.0:
                 continue
-            a, away = row(area, t), minus(x, row(middle, t))
+            n, away = row(area, t), minus(x, row(middle, t))
             y = minus(away, (foot * V0, foot * V1, foot * V2))
-            weight, pulled = g[t] / size, dot(a, y) / width**2
-            for k in range(slid.shape[2]):
-                change = 0.0
+            weight, pulled = g[t] / size, dot(n, y) / width**2
+            for k in range(3):
+                before, after = triangles[t, k - 1], triangles[t, k - 2]
+                turn = cross(minus(row(vertices, after), row(vertices, before)), y)
                 for c in range(3):
-                    change += y[c] * turned[t, c, k] + (pulled * away[c] - a[c]) * slid[t, c, k]
-                derivative[i, k] += weight * change
-    return distance, derivative
+                    change = 0.5 * turn[c] + (pulled * away[c] - n[c]) / 3.0
+                    slope[i, triangles[t, k], c] += weight * change
+    return distance, slope
 
 
 def across_curve(curve: FloatArray, std: float) -> FloatArray:

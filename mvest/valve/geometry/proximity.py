@@ -42,6 +42,16 @@ def dot(a: Vector, b: Vector) -> float:
 
 
 @njit(cache=True)
+def cross(a: Vector, b: Vector) -> Vector:
+    """The vector product."""
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+@njit(cache=True)
 def closest_on_triangle(p: Vector, a: Vector, b: Vector, c: Vector) -> Vector:
     """Barycentric coordinates ``(u, v, w)`` of the point of triangle ``abc`` closest to `p`."""
     ab = minus(b, a)
