@@ -48,7 +48,7 @@ LEAST_CURVATURE = 0.1
 MAX_REJECTIONS = 8
 """Largest number of rejected steps in a row."""
 
-MAX_HESSIANS, MAX_NEWTON_STEPS, MAX_HALVINGS = 2, 6, 5
+MAX_HESSIANS, MAX_NEWTON_STEPS, MAX_HALVINGS = 4, 6, 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,9 +248,11 @@ def _with_second_derivatives(
     along conjugate directions of a Gaussian, first of Gauss-Newton's (Nocedal and Wright 2006,
     section 8.1); its inverse is the covariance (Laplace). The directions are the columns of
     Cholesky's factor. Newton steps with the Hessian lead to the minimum. If that is more than a
-    standard deviation away, the Hessian is computed again there.
+    standard deviation away, the Hessian is computed again there; also if J is not convex at the
+    start, as where Gauss-Newton creeps along a bent valley: the steps then take its eigenvalues to
+    be at least `LEAST_CURVATURE` (section 3.4).
 
-    Returns None if a run fails, J is not convex, or its minimum is not reached.
+    Returns None if a run fails, or no minimum at which J is convex is reached.
     """
     covariance = gaussian.covariance
     for _ in range(MAX_HESSIANS):
@@ -263,26 +265,32 @@ def _with_second_derivatives(
                 return None
             rows.append(0.5 * C.T @ (up - down))
         hessian = 0.5 * (np.array(rows) + np.array(rows).T)
-        if np.linalg.eigvalsh(hessian)[0] < LEAST_CURVATURE:
+        curvatures, axes = np.linalg.eigh(hessian)
+        convex, axes = curvatures[0] >= LEAST_CURVATURE, C @ axes
+        inverse = axes / np.maximum(curvatures, LEAST_CURVATURE) @ axes.T
+        begun, (point, reached) = point, _descended(run, point, inverse)
+        if point is begun and not (convex and reached):
             return None
-        inverse = C @ np.linalg.inv(hessian) @ C.T
-        begun = point
-        for _ in range(MAX_NEWTON_STEPS):
-            slope = point.slope(run)
-            step = -inverse @ slope
-            if -0.5 * float(step @ slope) <= NEGLIGIBLE_DECREASE:
-                break
-            lower = _lower(run, point, step, slope)
-            if lower is None:
-                return None
-            point = lower
-        else:
-            return None
-        moved = np.linalg.solve(C, point.x - begun.x)
-        if float(moved @ hessian @ moved) <= 1.0:
-            return point, inverse
-        covariance = inverse
+        if convex:
+            moved = np.linalg.solve(C, point.x - begun.x)
+            if reached and float(moved @ hessian @ moved) <= 1.0:
+                return point, inverse
+            covariance = inverse
     return None
+
+
+def _descended(run: FilterRun, point: "_Point", inverse: FloatArray) -> "tuple[_Point, bool]":
+    """The point after Newton steps with one inverse Hessian, and whether J is lowest there."""
+    for _ in range(MAX_NEWTON_STEPS):
+        slope = point.slope(run)
+        step = -inverse @ slope
+        if -0.5 * float(step @ slope) <= NEGLIGIBLE_DECREASE:
+            return point, True
+        lower = _lower(run, point, step, slope)
+        if lower is None:
+            break
+        point = lower
+    return point, False
 
 
 def _lower(run: FilterRun, point: "_Point", step: FloatArray, slope: FloatArray) -> "_Point | None":

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from mvest.estimation.estimate import Reason
 from mvest.estimation.filters.iterated import IteratedFilter
@@ -76,3 +77,20 @@ def test_iterations_that_do_not_end_are_ended_by_newton_steps():
     assert better.reason is Reason.CONVERGED
     exact = filtered(y, tolerance=1e-8, max_iterations=200)
     assert np.all(np.abs(better.mean - exact.mean) < 0.1 * exact.std)
+
+
+def test_newton_steps_leave_where_the_objective_is_not_convex():
+    y = observed(9.0)
+    begun = {"max_iterations": 1, "start": (0.4, -0.3)}
+    plain, better = filtered(y, **begun), filtered(y, **begun, second_order=True)
+
+    def curvature(m):
+        slope = LINEAR + np.outer(BENT, BEND @ m)
+        return slope.T @ slope - BENT @ (y - bent(m).y) * BEND + np.eye(2)
+
+    assert np.linalg.eigvalsh(curvature(plain.mean))[0] < -0.5
+    assert better.reason is Reason.CONVERGED
+    mode = minimize(lambda m: 0.5 * (np.sum((y - bent(m).y) ** 2) + m @ m), better.mean).x
+    true = np.sqrt(np.diag(np.linalg.inv(curvature(mode))))
+    assert np.all(np.abs(better.mean - mode) < 0.1 * true)
+    assert better.std == pytest.approx(true, rel=0.05)
