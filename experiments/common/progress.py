@@ -1,4 +1,4 @@
-"""Progress of a single run: steps of a filter, forward solves, time left.
+"""Progress of a single run: steps of a filter, forward solves, elapsed time.
 
 A terminal shows a bar. Elsewhere, and for events that matter, lines go to standard error, which in
 a sweep is the job's log. There is a line at least every ten seconds.
@@ -83,19 +83,15 @@ class SolveBar:
     """Reports steps of a filter; a bar moves with the time steps of a forward solve.
 
     ``steps`` is the number of time steps of one solve; 0 for a model that reports none, which gets
-    no bar. ``names`` are those of the parameters of :meth:`iterate`, and ``whole`` is the expected
-    time of everything in units of the first solve, if it is known.
+    no bar. ``names`` are those of the parameters of :meth:`iterate`.
     """
 
-    def __init__(
-        self, title: str, steps: int, names: Sequence[str] = (), whole: float = 0.0
-    ) -> None:
-        self._title, self._steps, self._names, self._whole = title, steps, list(names), whole
+    def __init__(self, title: str, steps: int, names: Sequence[str] = ()) -> None:
+        self._title, self._steps, self._names = title, steps, list(names)
         self._made, self._reached = 0, math.inf  # steps of the present solve, and its time
-        self._solve, self._first = 1, 0.0  # number of the present solve, and seconds of the first
+        self._solve = 1  # number of the present solve
         bar = {"total": steps, "desc": title, "unit": "step", "disable": None if steps else True}
         self._lines = Heartbeat(self._status, **bar)
-        self._now = self._lines.began
 
     def __enter__(self) -> SolveBar:
         return self
@@ -111,7 +107,7 @@ class SolveBar:
             self._lines.bar.set_description(
                 f"{self._title}, forward solve {self._solve}", refresh=False
             )
-        self._reached, self._now = time_s, time.monotonic()
+        self._reached = time_s
         self._made += 1
         self._lines.bar.update(1)
 
@@ -123,25 +119,20 @@ class SolveBar:
             names = [name for name in names if name.startswith("E_f.")]
         values = [f"{name} {value:.4g}" for name, value in zip(names, m, strict=False)]
         step = f"step {number}: objective {objective:.4g}"
-        self._lines.say(", ".join([self._title, step, *values, *self._left()]))
+        self._lines.say(", ".join([self._title, step, *values, self._elapsed()]))
 
     def _end_solve(self) -> None:
         if self._made:
-            self._first = self._first or self._now - self._lines.began
             self._solve, self._made, self._reached = self._solve + 1, 0, math.inf
 
     def _status(self) -> str:
         """Progress within a solve."""
         of = f" of {self._steps}" if self._steps >= self._made else ""
         solve = f"forward solve {self._solve}: {self._made} time steps{of}"
-        return ", ".join([self._title, solve, *self._left()])
+        return ", ".join([self._title, solve, self._elapsed()])
 
-    def _left(self) -> list[str]:
-        """The elapsed time, and an estimate of the time left if the whole is known."""
-        elapsed = self._lines.elapsed
-        left = self._whole * self._first - elapsed
-        more = [f"about {duration(left)} left"] if left > 0.1 * elapsed else []
-        return [f"{duration(elapsed)} elapsed", *more]
+    def _elapsed(self) -> str:
+        return f"{duration(self._lines.elapsed)} elapsed"
 
 
 @contextmanager

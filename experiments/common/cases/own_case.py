@@ -44,9 +44,6 @@ from mvest.problem.registration import REGISTRATION
 from mvest.quantities import Value
 from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
 
-WHOLE = 50.0  # time of a personalisation in units of its first closure; the example case took 52
-
-
 CaseInput = Annotated[
     str | None, Reads(lambda value, _: contents(files_of_case(Path(value))) or value)
 ]
@@ -127,7 +124,7 @@ def run_case(
     steps = len(settings.mechanics.protocol.steps())
     free = [u.name for u in settings.unknowns if not u.fixed]
     names = sorted(free, key=lambda name: name in REGISTRATION)  # the order of estimation
-    with SolveBar(case.name, steps, names, WHOLE) as bar:
+    with SolveBar(case.name, steps, names) as bar:
         fit = personalise(
             case, settings, store=mesh_store(values), on_step=bar.step, on_iterate=bar.iterate
         )
