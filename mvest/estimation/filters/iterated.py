@@ -49,6 +49,7 @@ MAX_REJECTIONS = 8
 """Largest number of rejected steps in a row."""
 
 MAX_HESSIANS, MAX_NEWTON_STEPS, MAX_HALVINGS = 4, 6, 5
+"""Of J in search of its minimum, of steps with each, and of halvings of a step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +120,9 @@ class IteratedFilter(Filter):
     #: (p,) parameters or None, first iterate; None starts at the prior's mean
     start: tuple[float, ...] | None = None
     max_learned: int = 12  #: iterates at which the noise of a `NoiseFamily` is learned
-    #: whether mode and covariance are computed with second derivatives, from 2p further runs, if
-    #: Gauss-Newton does not converge or the check of its posterior fails
+    #: whether mode and covariance are computed with second derivatives, from 2p further runs at up
+    #: to `MAX_HESSIANS` points, if Gauss-Newton does not converge or the check of its posterior
+    #: fails
     second_order: bool = False
 
     def __post_init__(self) -> None:
