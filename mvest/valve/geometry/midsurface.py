@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.distance import cdist
 
@@ -40,6 +41,10 @@ RIM_SHARE = 0.8
 """Distance from an edge, relative to the thickness, within which the nearest wall is the rim."""
 FINE = 200
 """Samples of a line from annulus to free edge before its vertices are redistributed."""
+LEVELS, ANGLES = 50, 8
+"""Samples, from annulus to free edge and per column around the valve, that find the commissures."""
+SEAM_SMOOTHING = 0.0025
+"""Weight of a seam's squared second derivative beside the mean squared distance from the labels."""
 TIP_CONE = 60.0
 """Largest angle (degrees) between a papillary tip and its commissure, around the valve."""
 
@@ -158,8 +163,8 @@ def midsurface(
     pair = _PairedWalls(first, second, annulus)
     perimeter = np.mean([_length(first.vertices[loop]) for loop in first.loops])
     columns = max(24, 2 * round(perimeter / edge_mm / 2))
-    angle = 2 * np.pi * np.arange(2 * columns) / (2 * columns)
-    lines = pair.middle(angle, np.linspace(0, 1, FINE)[:, None])
+    angle = 2 * np.pi * np.arange(ANGLES * columns) / (ANGLES * columns)
+    lines = pair.middle(angle, np.linspace(0, 1, LEVELS)[:, None])
     heights = _arc_lengths(lines)[-1]
     if label is not None:
         seams = _label_seams(lines, angle, label)
@@ -254,9 +259,10 @@ def _periodic(angle: FloatArray, common: FloatArray, own: FloatArray) -> FloatAr
 def _label_seams(
     lines: FloatArray, angle: FloatArray, label: Callable[[FloatArray], IntArray]
 ) -> FloatArray:
-    """Angles ``(2, 2)`` of the seams, by end and commissure; the first one starts the anterior.
+    """Angles ``(FINE, 2)`` of the seams, by level and commissure; the first starts the anterior.
 
-    The anterior label is an arc of each level line; its fraction and centre give both ends.
+    The anterior label is an arc of each level line; its fraction and centre give both ends. Seams
+    bend most at the annulus, so a straight fit would displace their ends there.
     """
     front = label(lines.reshape(-1, 3)).reshape(lines.shape[:2]) == 0
     share = front.mean(axis=1)
@@ -273,11 +279,12 @@ def _label_seams(
             "the labels do not part the leaflets at two commissures, from annulus to free edge; "
             "give anterior= and posterior=, or leaflets= if one label is both of them"
         )
-    ends = []
-    for seam in (centre - np.pi * share, centre + np.pi * share):
-        slope, start = np.polyfit(s[known], seam[known], 1)
-        ends.append([start, start + slope])
-    return np.array(ends).T
+    at = np.clip(np.linspace(0, 1, FINE), *s[known][[0, -1]])
+    seams = [
+        make_smoothing_spline(s[known], seam[known], lam=SEAM_SMOOTHING)(at)
+        for seam in (centre - np.pi * share, centre + np.pi * share)
+    ]
+    return np.stack(seams, axis=1)
 
 
 def _short_seams(
@@ -312,7 +319,7 @@ def _short_seams(
         away = np.linalg.norm(annulus - np.asarray(anterior), axis=1)
         first = bool(within[away.argmin()])
     seam = np.array([angle[a], angle[b]]) if first else np.array([angle[b], angle[a] + 2 * np.pi])
-    return np.stack([seam, seam])
+    return np.tile(seam, (FINE, 1))
 
 
 def _shortest(annulus: FloatArray, heights: FloatArray, tips: FloatArray) -> IntArray:
@@ -330,21 +337,19 @@ def _shortest(annulus: FloatArray, heights: FloatArray, tips: FloatArray) -> Int
 
 def _sheet(pair: _PairedWalls, seams: FloatArray, columns: int, rows: int) -> FloatArray:
     """A first midsurface ``(rows, columns, 3)``, with columns at equal arc lengths of the edges."""
-    angles = []
-    for end in (0, 1):
-        begin, middle = seams[end]
-        middle = begin + np.mod(middle - begin, 2 * np.pi)
-        stops, parts = (begin, middle, begin + 2 * np.pi), []
-        for low, high in itertools.pairwise(stops):
-            fine = np.linspace(low, high, FINE)
-            curve = pair.middle(fine, np.full(FINE, float(end)))
-            arc = np.append(0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
-            share = np.arange(columns // 2) / (columns // 2)
-            parts.append(np.interp(share, arc / arc[-1], fine))
-        angles.append(np.concatenate(parts))
-    angles[1] += 2 * np.pi * np.round((angles[0][0] - angles[1][0]) / (2 * np.pi))
-    s = np.linspace(0, 1, FINE)[:, None]
-    return _spread(pair.middle((1 - s) * angles[0] + s * angles[1], s), rows)
+    begin, middle = seams.T[..., None]
+    middle = begin + np.mod(middle - begin, 2 * np.pi)
+    s, share = np.linspace(0, 1, FINE)[:, None], np.linspace(0, 1, FINE)
+    stops, angles = (begin, middle, begin + 2 * np.pi), []
+    for low, high in itertools.pairwise(stops):
+        shares = []
+        for end in (0, -1):
+            curve = pair.middle(low[end] + share * (high - low)[end], s[end])
+            arc = _arc_lengths(curve[:, None])[:, 0]
+            equal = np.arange(columns // 2) / (columns // 2)
+            shares.append(np.interp(equal, arc / arc[-1], share))
+        angles.append(low + ((1 - s) * shares[0] + s * shares[1]) * (high - low))
+    return _spread(pair.middle(np.concatenate(angles, axis=1), s), rows)
 
 
 def _arc_lengths(lines: FloatArray) -> FloatArray:

@@ -46,7 +46,8 @@ def test_midsurface_is_that_which_was_thickened(valve: Valve, middle: Midsurface
     thickness = nearest.interpolate(surface.thickness, surface.triangles)
     error = middle.thickness - thickness
     assert np.abs(error).mean() < 0.02
-    assert np.percentile(np.abs(error), 95) < 0.05
+    # At most one vertex in ten is worse: those at the sharp bends of the commissures.
+    assert np.percentile(np.abs(error), 90) < 0.03
 
 
 def test_it_is_a_band_in_good_order(valve: Valve, middle: Midsurface) -> None:
@@ -97,6 +98,31 @@ def test_labels_decide_where_they_are_known(valve: Valve, solid: ClosedSurface) 
     centres = swapped.vertices[swapped.triangles].mean(axis=1)
     assert (label(centres) == swapped.region).mean() > 0.98
     assert swapped.derived == ()
+
+
+def test_a_seam_that_bends_at_the_annulus_ends_where_its_labels_do(
+    valve: Valve, solid: ClosedSurface
+) -> None:
+    """A straight line through these labels would end 1 mm from the seam."""
+    surface = valve.surface
+    x, triangles = surface.vertices, surface.triangles
+    own = surface_coordinates(x, triangles, valve.annulus, valve.free_edge)
+    values = np.column_stack([np.cos(own.theta), np.sin(own.theta), own.s])
+
+    def beyond_seam(points: FloatArray) -> FloatArray:
+        """Angle from the seams, whose ends at the annulus are 70 degrees from the middle."""
+        cosine, sine, s = closest_points(points, x, triangles).interpolate(values, triangles).T
+        seam = np.deg2rad(85.0 - 15.0 * np.exp(-s / 0.15))
+        return np.asarray(np.abs(np.arctan2(sine, cosine)) - seam)
+
+    def label(points: FloatArray) -> IntArray:
+        return (beyond_seam(points) > 0).astype(np.int64)
+
+    found = midsurface(solid.vertices, solid.triangles, tips=valve.papillary_tips, label=label)
+    ends = found.vertices[found.commissures[:, 0]]
+    perimeter = np.linalg.norm(np.diff(x[valve.annulus], axis=0), axis=1).sum()
+    off = beyond_seam(ends) / (2 * np.pi) * perimeter
+    assert np.abs(off).max() < 0.25
 
 
 def test_what_is_no_thick_band_is_refused(solid: ClosedSurface) -> None:
