@@ -44,7 +44,7 @@ FINE = 200
 LEVELS, ANGLES = 50, 8
 """Samples, from annulus to free edge and per column around the valve, that find the commissures."""
 SEAM_SMOOTHING = 0.0025
-"""Weight of a seam's squared second derivative beside the mean squared distance from the labels."""
+"""Weight of a seam's squared second derivative beside its squared distances from the labels."""
 TIP_CONE = 60.0
 """Largest angle (degrees) between a papillary tip and its commissure, around the valve."""
 
@@ -271,18 +271,18 @@ def _label_seams(
             f"{100 * front.mean():.0f} % of the leaflets are anterior by their labels; expected "
             "both leaflets"
         )
-    centre = np.unwrap(np.angle(np.sum(front * np.exp(1j * angle), axis=1)))
-    s = np.linspace(0, 1, len(lines))
     known = (share > 0.02) & (share < 0.98)
     if known.mean() < 0.5:
         raise GeometryError(
             "the labels do not part the leaflets at two commissures, from annulus to free edge; "
             "give anterior= and posterior=, or leaflets= if one label is both of them"
         )
-    at = np.clip(np.linspace(0, 1, FINE), *s[known][[0, -1]])
+    s, half = np.linspace(0, 1, len(lines))[known], np.pi * share[known]
+    centre = np.unwrap(np.angle(np.sum(front[known] * np.exp(1j * angle), axis=1)))
+    at = np.clip(np.linspace(0, 1, FINE), s[0], s[-1])
     seams = [
-        make_smoothing_spline(s[known], seam[known], lam=SEAM_SMOOTHING)(at)
-        for seam in (centre - np.pi * share, centre + np.pi * share)
+        make_smoothing_spline(s, seam, lam=SEAM_SMOOTHING)(at)
+        for seam in (centre - half, centre + half)
     ]
     return np.stack(seams, axis=1)
 
