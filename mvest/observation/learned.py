@@ -9,7 +9,6 @@ another follows from the observation itself (see `mvest.estimation.noise` and
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mvest.errors import InputError, require_numbers
 from mvest.estimation.noise import NoiseBlock, NoiseFamily
@@ -21,9 +20,6 @@ from mvest.typing import FloatArray
 
 ROUGH, CURVES = "rough part", "curves"
 """Names of the standard deviations of the rough part and of the points of curves."""
-
-NEIGHBOURS = 12
-"""Neighbouring points over which positions are averaged."""
 
 FAR = 100.0
 """Correlation lengths by which leaflets are moved apart, so that their errors are independent."""
@@ -69,7 +65,7 @@ def error_family(
     observation: Observation | SurfaceObservation,
     beliefs: ErrorBeliefs,
     length: float,
-    points: FloatArray | None = None,
+    shape: FloatArray | None = None,
 ) -> NoiseFamily:
     """The noise of an observation, to be learned.
 
@@ -80,23 +76,27 @@ def error_family(
     beliefs : ErrorBeliefs
     length : float
         mm, stated correlation length; 0: independent.
-    points : (n, 3) mm, optional
-        Vertices at rest, for corresponding vertices.
+    shape : (n, 3) or (f, n, 3) mm
+        Where errors are correlated. For corresponding vertices: all vertices at rest. For surfaces:
+        the observed frames of a valve near them, on which errors are correlated over the places
+        nearest to the points. The points themselves contain their errors: on a flat leaflet the
+        height of a point is its error, and a smooth function of its position. None for surfaces:
+        the points themselves.
     """
     if isinstance(observation, Observation):
-        if points is None or points.shape != observation.positions.shape[1:]:
+        if shape is None or shape.shape != observation.positions.shape[1:]:
             raise InputError("errors of corresponding vertices need all vertices at rest")
         stds = np.sqrt(observation.variance)
         stated = float(stds[-1])
-        scale = np.ones(len(points)) if observation.scale is None else observation.scale
+        scale = np.ones(len(shape)) if observation.scale is None else observation.scale
         parts = [
-            (frame, ROUGH, points[seen], scale[seen] * own / stds[-1], 3)
+            (frame, ROUGH, shape[seen], scale[seen] * own / stds[-1], 3)
             for frame, seen, own in zip(observation.frames, observation.seen, stds, strict=True)
         ]
     else:
         stated, parts = observation.std_mm, []
-        for seen in observation.seen:
-            at, edge = map(_averaged, seen.apart(FAR * (length or beliefs.length_mm)))
+        places = observation.places(FAR * (length or beliefs.length_mm), shape)
+        for seen, (at, edge) in zip(observation.seen, places, strict=True):
             scale = np.ones(len(at)) if seen.scale is None else seen.scale
             parts += [(seen.frame, ROUGH, at, scale, 1)] * (len(at) > 0)
             parts += [(seen.frame, CURVES, edge, np.ones(len(edge)), 2)] * (len(edge) > 0)
@@ -113,11 +113,3 @@ def error_family(
             quantities[f"frame {frame}"] = LogNormal(1.0, beliefs.frame_factor)
         blocks.append(block)
     return NoiseFamily(tuple(blocks), quantities, bands, beliefs.resolution_mm)
-
-
-def _averaged(points: FloatArray) -> FloatArray:
-    """Means over neighbours: a point's own error is part of its position, and hardly of these."""
-    if not len(points):
-        return points
-    near = cKDTree(points).query(points, min(NEIGHBOURS, len(points)))[1]
-    return np.asarray(points[near.reshape(len(points), -1)].mean(axis=1))

@@ -101,19 +101,22 @@ class ObservedSurface:
         scale = None if self.scale is None else self.scale[keep]
         return replace(self, points=self.points[keep], region=self.region[keep], scale=scale)
 
-    def apart(self, distance: float) -> tuple[FloatArray, FloatArray]:
-        """Points ``(q, 3)`` and compared points of the free edge, by leaflet ``distance`` mm apart.
+    def apart(
+        self, distance: float, points: FloatArray, edge: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Places ``(q, 3)`` of the points and of the compared ones of the free edge.
 
-        Errors of different leaflets are independent, and so are errors of distant points.
+        Those of different leaflets are moved ``distance`` mm apart, since errors of different
+        leaflets are independent, and so are errors of distant points.
         """
-        every = [self.points] if self.free_edge is None else [self.points, self.free_edge]
+        every = [points] if edge is None else [points, edge]
         distance += float(np.ptp(np.concatenate(every), axis=0).max())
-        points = self.points + distance * self.region[:, None]
-        if self.free_edge is None:
+        points = points + distance * self.region[:, None]
+        if edge is None:
             return points, np.zeros((0, 3))
-        kept, region = self.compared, self.free_edge_region
-        edge = self.free_edge if region is None else self.free_edge + distance * region[:, None]
-        return points, edge[kept]
+        if (region := self.free_edge_region) is not None:
+            edge = edge + distance * region[:, None]
+        return points, edge[self.compared]
 
     @property
     def compared(self) -> BoolArray:
@@ -280,6 +283,25 @@ class SurfaceObservation:
 
         return distances
 
+    def places(
+        self, distance: float, shape: FloatArray | None = None
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Of each frame the points and the compared points of the free edge, see `apart`.
+
+        With ``shape (f, n, 3)`` mm, the places of predicted frames that are nearest to them.
+        """
+        surface = self.surface
+        for k, seen in enumerate(self.seen):
+            points, edge, loop = seen.points, seen.free_edge, surface.free_edge
+            if shape is not None:
+                drawn, points = surface.drawn(shape[k]), np.empty_like(points)
+                for region, own in seen.by_region():
+                    points[own] = nearest(seen.points[own], drawn, surface.leaflet(region))
+                if edge is not None and loop is not None:
+                    # Triangles without area.
+                    edge = nearest(edge, drawn, np.stack([loop, *2 * [np.roll(loop, -1)]], axis=1))
+            yield seen.apart(distance, points, edge)
+
     def distance(self, fitted: FloatArray) -> FloatArray:
         """Unsigned distances ``(q,)`` mm of the last frame's points to fitted ``(f, n, 3)``."""
         seen, distance = self.seen[-1], np.empty(len(self.seen[-1].points))
@@ -311,8 +333,7 @@ class SurfaceObservation:
 
     def _noise(self) -> NoiseCovariance:
         parts, length = [], self.correlation_length_mm
-        for seen in self.seen:
-            points, edge = seen.apart(1000.0 * length)
+        for seen, (points, edge) in zip(self.seen, self.places(1000.0 * length), strict=True):
             for at, scale, coordinates in ((points, seen.scale, 1), (edge, None, 2)):
                 if not len(at):
                     continue
@@ -321,6 +342,11 @@ class SurfaceObservation:
                     noise = SpatialCorrelation(at, length).noise(self.std_mm**2, coordinates)
                 parts.append(noise if scale is None else scaled_noise(noise, scale))
         return stacked_noise(parts)
+
+
+def nearest(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> FloatArray:
+    """Places ``(q, 3)`` of a surface that are nearest to points ``(q, 3)``."""
+    return closest_points(points, vertices, triangles).interpolate(vertices, triangles)
 
 
 def surface_distance(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> FloatArray:

@@ -208,7 +208,7 @@ class FrameErrors:
             fitted.observation(),
             fitted.settings.errors,
             fitted.length,
-            fitted.case.surface.vertices,
+            fitted.case.surface.vertices if fitted.corresponding else fitted.near,
         )
         if not fitted.corresponding:
             family = replace(family, resolution=max(family.resolution, SURFACE_MM))

@@ -155,7 +155,8 @@ class CaseProblem:
         """The generic valve, where every estimation starts; nothing is linearised yet."""
         start = self.stated.shared.start
         prediction = self.stated.shared(start)
-        return LinearisationPoint(self.stated, FrameErrors(self.fitted), start, prediction)
+        errors = FrameErrors(self.fitted.beside(prediction))
+        return LinearisationPoint(self.stated, errors, start, prediction)
 
     def filter(self, tolerance: float) -> IteratedFilter:
         """The filter of all unknowns, to a relative tolerance."""
@@ -243,7 +244,7 @@ def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstim
     prediction = generic.closure.shared(at)
     if not prediction.converged:
         return CaseEstimate(rough, generic, unaccounted=(prediction.reason,))
-    plain_errors = FrameErrors(problem.fitted)
+    plain_errors = FrameErrors(problem.fitted.beside(prediction))
     point = linearised(LinearisationPoint(generic.closure, plain_errors, at, prediction), problem)
     moved, unaccounted, first = None, point.errors.unaccounted, point
     if problem.case.error_samples is not None:

@@ -4,12 +4,15 @@ Corresponding vertices are compared one by one. Otherwise the points of a frame 
 the predicted surface, refined and smoothed.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Frame, Role, ValveCase
+from mvest.estimation.prediction import Prediction
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.surfaces import (
     UNKNOWN,
@@ -19,7 +22,7 @@ from mvest.observation.surfaces import (
 )
 from mvest.observation.vertices import Observation
 from mvest.personalisation.settings import PaperSettings, PersonaliseSettings
-from mvest.typing import BoolArray
+from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.triangles import directed_edges
 
@@ -52,6 +55,15 @@ class FittedFrames:
     valve: Valve  #: of the closure
     #: Names of several fitted frames in the order of prediction, the closed frame last.
     several: tuple[str, ...] | None
+    #: (f, n, 3) mm, the frames as a closed valve near them shows them, where errors of surfaces are
+    #: correlated (`mvest.observation.learned.error_family`)
+    near: FloatArray | None = None
+
+    def beside(self, prediction: Prediction) -> FittedFrames:
+        """The same near a closed valve, if it is closed."""
+        if not prediction.converged:
+            return self
+        return replace(self, near=prediction.y.reshape(-1, *self.case.surface.vertices.shape)[1:])
 
     @property
     def frames(self) -> tuple[Frame, ...]:

@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
 from mvest.estimation import Gaussian, IteratedFilter, Prediction
+from mvest.estimation.evidence import Evidence
 from mvest.estimation.noise import NoiseFamily
 from mvest.estimation.spectrum import matern
 from mvest.observation.learned import CURVES, ROUGH, ErrorBeliefs, error_family
@@ -99,7 +100,7 @@ def test_a_filter_learns_the_errors_of_distances_and_of_curves() -> None:
         )
 
     prior = Gaussian(np.zeros(2), np.eye(2))
-    family = error_family(observation, BELIEFS, 8.0)
+    family = error_family(observation, BELIEFS, 8.0, POINTS[None])
     found = IteratedFilter(1e-5)(observation.of(model), prior, observation.y, family)
     assert found.converged
     assert np.all(np.abs(found.mean - [0.7, 0.0]) < 3.0 * found.std)
@@ -111,9 +112,36 @@ def test_a_filter_learns_the_errors_of_distances_and_of_curves() -> None:
         assert low < true < high, name
 
 
+@pytest.mark.parametrize(("smooth", "rough"), [(0.6, 0.02), (0.3, 0.5)])
+def test_intervals_hold_although_points_are_seen_with_their_errors(
+    smooth: float, rough: float
+) -> None:
+    # Correlated over the points as seen, which contain errors and tilt, none of the intervals hold.
+    rng, runs, held = np.random.default_rng(3), 40, 0
+    root = np.linalg.cholesky(matern(cdist(POINTS, POINTS), 8.0) + 1e-9 * np.eye(N))
+    one = np.zeros(len(TRIANGLES), dtype=np.int64)
+    surface = PredictedSurface.refined(POINTS, TRIANGLES, one, None, 2.0, 1.0)
+    inner = np.all((POINTS[:, :2] > 2.9) & (POINTS[:, :2] < 19.6), axis=1)
+    H = np.column_stack([np.ones(N), (POINTS[:, 0] - 11.25) / 10.0])[inner]
+    for _ in range(runs):
+        errors = smooth * root @ rng.standard_normal((N, 3)) + rough * rng.standard_normal((N, 3))
+        points, truth = (POINTS + errors)[inner], rng.standard_normal(2)
+        points[:, 2] += H @ truth
+        seen = ObservedSurface("closed", points, np.zeros(len(points), dtype=np.int64))
+        family = error_family(
+            SurfaceObservation((seen,), surface, 0.5), BELIEFS, 10.0, POINTS[None]
+        )
+        evidence = Evidence(family, points[:, 2], H)
+        posterior = evidence.posterior()
+        mean, found = evidence.update(evidence.log(posterior.mean), 2)
+        variance = (found + evidence.learned(posterior, np.eye(2)).covariance)[1, 1]
+        held += int(abs(mean[1] - truth[1]) < 1.96 * np.sqrt(variance))
+    assert held >= 0.8 * runs
+
+
 def test_errors_of_a_curve_are_correlated_along_it_alone() -> None:
     observation = surface_observation(np.zeros(N), np.zeros((4 * SIDE - 4, 3)))
-    R = covariance(error_family(observation, BELIEFS, 8.0))
+    R = covariance(error_family(observation, BELIEFS, 8.0, POINTS[None]))
     q = len(observation.seen[0].points)
     assert np.abs(R[:q, q:]).max() < 1e-12
     curve = R[q:, q:].reshape(4 * SIDE - 4, 2, 4 * SIDE - 4, 2)
