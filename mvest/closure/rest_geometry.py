@@ -24,7 +24,7 @@ from mvest.mechanics.valve_system import (
 )
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.band import leaflet_normals, leaflet_normals_change
-from mvest.valve.anatomy.valve import Valve, lumped_areas_change
+from mvest.valve.anatomy.valve import lumped_areas_change
 from mvest.valve.geometry.proximity import ClosestPoints, closest_points
 from mvest.valve.geometry.triangles import unit_rows
 from mvest.valve.mesh.solid_mesh import Embedding, embed
@@ -43,15 +43,12 @@ class RestGeometry:
     ----------
     model : ClosureModel
         Its protocol must end in an equilibrium.
-    seen : ClosureModel, optional
-        The undisplaced model, if changes are measured from it.
     """
 
-    def __init__(self, model: ClosureModel, seen: ClosureModel | None = None) -> None:
+    def __init__(self, model: ClosureModel) -> None:
         if not model.settings.protocol.equilibrium:
             raise InputError("derivatives by the geometry need a closure that ends in equilibrium")
-        self.model, self.seen = model, seen or model
-        self.surface, nodes = self.seen.valve.surface, self.seen.mesh.nodes
+        self.model, self.surface, nodes = model, model.valve.surface, model.mesh.nodes
         vertices, triangles = self.surface.vertices, self.surface.triangles
         self._normals = leaflet_normals(self.surface)
         self._closest = closest_points(nodes, vertices, triangles)
@@ -71,13 +68,13 @@ class RestGeometry:
     @cached_property
     def _samples(self) -> ClosestPoints:
         """Positions of the contact samples on the surface."""
-        points = self.seen.contact_valve.surface.vertices
+        points = self.model.contact_valve.surface.vertices
         return closest_points(points, self.surface.vertices, self.surface.triangles)
 
     @cached_property
     def _sampled(self) -> Embedding:
         """The contact samples embedded in the mesh."""
-        return embed(self.seen.mesh, self.seen.contact_valve.surface.vertices)
+        return embed(self.model.mesh, self.model.contact_valve.surface.vertices)
 
     @cached_property
     def _patches(self) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -91,7 +88,7 @@ class RestGeometry:
 
     def _ends(self, values: FloatArray) -> FloatArray:
         """Values at the chordal insertions, from values ``(n, ...)`` at the surface's vertices."""
-        own, chordae = self.surface, self.seen.valve.chordae
+        own, chordae = self.surface, self.model.valve.chordae
         return self._at(closest_points(chordae.insertion, own.vertices, own.triangles), values)
 
     def _still(self, q: int) -> FloatArray:
@@ -133,7 +130,7 @@ class RestGeometry:
         Where faces of the mesh are not equally far from the surface, its middle moves, too.
         """
         faces = self._height[:, None] * self._at(self._closest, factors.T)
-        own = self.seen.contact_valve.surface.thickness
+        own = self.model.contact_valve.surface.thickness
         thickness = own * self._at(self._samples, factors.T).T
         nodes = self._normal[:, :, None] * faces[:, None]
         return replace(self._followed(nodes), thickness=thickness)
@@ -160,8 +157,7 @@ class RestGeometry:
 
     def rest_lengths(self, changes: FloatArray) -> RestVariation:
         """Relative changes ``(q, k)`` of the rest lengths of the chordae's segments."""
-        share = self.seen.valve.chordae.rest_length / self.model.valve.chordae.rest_length
-        return RestVariation(self._still(len(changes)), rest_length=changes * share)
+        return RestVariation(self._still(len(changes)), rest_length=changes)
 
     def insertions(self, moves: FloatArray) -> RestVariation:
         """Displacements ``(q, c, 3)`` mm of the chordal insertions at rest."""
@@ -173,61 +169,6 @@ class RestGeometry:
     def variation(self, parts: Mapping[str, FloatArray]) -> RestVariation:
         """Change of several `PARTS` at once, each ``(q, ...)`` in its method's form."""
         return RestVariation.summed([getattr(self, name)(values) for name, values in parts.items()])
-
-    def displaced(self, parts: Mapping[str, FloatArray]) -> ClosureModel:
-        """A fresh model of the valve with another geometry; its guide changes too.
-
-        Embeddings keep their material points. A displacement of the open shape moves the mesh as
-        its derivative predicts. Junctions of the chordae stay: their place at rest only matters
-        while they are slack.
-
-        GeometryError if a leaflet would have no thickness, or a chord no length.
-
-        ``parts``: some of `PARTS` -> one quantity each, where `variation` takes several.
-        """
-        own = {name: np.asarray(values)[None] for name, values in parts.items()}
-        model, nodes = self.model, np.zeros_like(self.model.mesh.nodes)
-        for name in ("shape", "thickness"):
-            if name in own:
-                nodes = nodes + getattr(self, name)(own[name]).nodes[0]
-        mesh = replace(model.mesh, nodes=model.mesh.nodes + nodes)
-        if "fibres" in own:
-            angle, normal = parts["fibres"][mesh.region][:, None, None], self._normal[mesh.elements]
-            along = np.sum(normal * mesh.fibre, axis=2, keepdims=True) * normal
-            across = np.cross(normal, mesh.fibre)
-            fibre = along + np.cos(angle) * (mesh.fibre - along) + np.sin(angle) * across
-            mesh = replace(mesh, fibre=fibre)
-        ends = self._ends(model.observed(nodes)) + parts.get("insertions", 0.0)
-        chordae = replace(
-            model.valve.chordae,
-            insertion=model.valve.chordae.insertion + ends,
-            rest_length=model.valve.chordae.rest_length * (1.0 + parts.get("rest_lengths", 0.0)),
-        )
-
-        def moved(
-            valve: Valve, by: FloatArray, thicker: FloatArray, to: FloatArray | float
-        ) -> Valve:
-            annulus, tips = np.array(valve.motion.annulus), np.array(valve.motion.papillary_tips)
-            annulus[0] += by[valve.annulus]
-            annulus[-1] += to
-            tips[-1] += parts.get("tips", 0.0)
-            surface = replace(
-                valve.surface,
-                vertices=valve.surface.vertices + by,
-                thickness=valve.surface.thickness * (1.0 + thicker),
-            )
-            motion = replace(valve.motion, annulus=annulus, papillary_tips=tips)
-            return replace(valve, surface=surface, chordae=chordae, motion=motion)
-
-        thickness = parts.get("thickness", np.zeros(len(self.surface.vertices)))
-        thicker = self._at(self._samples, thickness)
-        annulus = parts.get("annulus", 0.0)
-        contact = moved(model.contact_valve, self._sampled(nodes), thicker, annulus)
-        same = model.contact_valve is model.valve
-        valve = contact if same else moved(model.valve, model.observed(nodes), thickness, 0.0)
-        guide = None if model.guide is None else RestGeometry(model.guide).displaced(parts)
-        model = replace(model, mesh=mesh, guide=guide, rounded_start=False)
-        return replace(model, valve=valve, contact_valve=contact)
 
     def change(
         self,

@@ -106,10 +106,7 @@ def predicted_frames(
     closure, fitted, case = point.closure, problem.fitted, problem.case
     shown = closed.reshape(-1, len(case.surface.vertices), 3)[-len(fitted.frames) :]
     frames = {frame.name: points for frame, points in zip(fitted.frames, shown, strict=True)}
-    # Annulus and tips have the same errors as in the fitted frames.
-    further = {
-        frame.name: closure.held(held_state(problem.stated.model, frame)) for frame in case.held_out
-    }
+    further = {frame.name: held_state(closure.model, frame) for frame in case.held_out}
     if not further:
         return frames
     registered, states = closure.registered, list(further.values())

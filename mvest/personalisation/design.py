@@ -42,7 +42,7 @@ def expect_case(
     point = problem.generic()
     if not point.prediction.converged:
         return Expected(reason=point.prediction.reason)
-    point = linearised(point, problem)
+    point = linearised(point)
     if case.error_samples is not None:
         point = point.sampled()
     seen = predict(
@@ -191,7 +191,7 @@ def design_case(
     generic = problem.generic()
     if not generic.prediction.converged:
         return generic.prediction.reason
-    errors = linearised(generic, problem).errors
+    errors = linearised(generic).errors
     observation, columns = problem.fitted.observation(), errors.columns()
     # Prior standard deviations: relative for positive unknowns, 1 for modes of the geometry.
     knowledge = {

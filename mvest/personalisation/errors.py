@@ -8,13 +8,12 @@ frames of one volume. The last two are linearised about one closed valve (`linea
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.noise import (
@@ -54,8 +53,7 @@ class WeighedObservation:
 
     plain: Observed
     R: NoiseCovariance
-    #: ``(k,)``, added to the observation: effect of the displaced geometry on the prediction, and
-    #: the prediction's expected error.
+    #: ``(k,)``, added to the observation: the prediction's expected error.
     offset: FloatArray | float = 0.0
 
     @property
@@ -84,8 +82,6 @@ class FrameErrors:
     fitted: FittedFrames
     #: Uncertain geometry; None before the first linearisation.
     modes: tuple[GeometryModes, ...] | None = None
-    #: Amplitudes ``(q,)`` by kind that displace the model's geometry; empty: as measured.
-    displaced_by: tuple[FloatArray, ...] = ()
     sources: tuple[ErrorSource, ...] = ()  #: errors of geometry, law and mesh
     #: Effect of the case's error samples on the predicted and the observed closed frame.
     frame_samples: FrameSamples | None = None
@@ -156,16 +152,9 @@ class FrameErrors:
         sizes = self.source_sizes(learned)
         return tuple(sizes[own.name] for own in self.geometry)
 
-    def offset(self, modes: Sequence[FloatArray]) -> FloatArray:
-        """Effect ``(k,)`` of amplitudes ``(q,)`` of each kind of geometry on the observation."""
-        return np.sum([s.rows @ z for s, z in zip(self.geometry, modes, strict=True)], axis=0)
-
     def observation(self) -> Observed:
         """The fitted frames with the noise of all errors."""
         plain, family, offset = self.fitted.observation(), self.family, self.expected
-        if self.displaced_by and self.geometry:
-            noise = self.noise() if family is None else family
-            return WeighedObservation(plain, noise, offset + self.offset(self.displaced_by))
         if self.samples is not None:
             if family is None:
                 return WeighedObservation(plain, self.samples.noise, offset)
@@ -219,11 +208,6 @@ class FrameErrors:
             learned.append(ErrorColumns(KNOWN, np.concatenate(known, axis=1)))
         return replace(family, columns=tuple(learned))
 
-    def displaced(self, modes: tuple[FloatArray, ...]) -> FrameErrors:
-        """Errors about a geometry displaced by ``modes``, before it is linearised."""
-        others = tuple(source for source in self.sources if source.modes is None)
-        return FrameErrors(self.fitted, self.modes, modes, others)
-
     def as_stated(self) -> FrameErrors:
         """The errors if geometry and law were known: only error samples remain."""
         plain = FrameErrors(self.fitted, self.modes)
@@ -233,20 +217,11 @@ class FrameErrors:
         return replace(plain, frame_samples=self.frame_samples, samples=samples)
 
 
-def linearise(
-    errors: FrameErrors, valve: ClosedValve, seen: ClosureModel | None = None
-) -> FrameErrors:
+def linearise(errors: FrameErrors, valve: ClosedValve) -> FrameErrors:
     """Errors of the geometry about a closed valve, and those of law and mesh if still unknown.
 
     Effects of law and mesh hardly depend on the linearisation point, and take as long to compute
-    as those of the geometry.
-
-    Parameters
-    ----------
-    errors : FrameErrors
-        Those about another closed valve, or without sources.
-    seen : ClosureModel, optional
-        Of the measured geometry, if that of ``valve`` is displaced.
+    as those of the geometry. ``errors`` are those about another closed valve, or without sources.
     """
     settings, observation = errors.fitted.settings, errors.fitted.observation()
     geometry, laws = settings.nuisance_geometry, settings.nuisance_law
@@ -261,7 +236,7 @@ def linearise(
         if modes is None:
             modes = geometry_modes(errors.fitted.case, geometry, valve.closure()[0])
             errors = replace(errors, modes=modes)
-        found.append(geometry_sources(modes, valve, observation, errors.single_noise(), seen))
+        found.append(geometry_sources(modes, valve, observation, errors.single_noise()))
     if others:
         found.append(others)
     elif laws or settings.mesh.error_std:

@@ -17,18 +17,16 @@ import numpy as np
 from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
-from mvest.errors import GeometryError, InputError
-from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.errors import InputError
+from mvest.estimation.estimate import Estimate, OnIterate
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.prediction import Prediction, of_some, predict
+from mvest.estimation.prediction import Prediction, of_some
 from mvest.estimation.run import Filter
 from mvest.estimation.transform import Log, to_filter
 from mvest.personalisation.errors import FrameErrors, WeighedObservation, linearise, with_samples
 from mvest.personalisation.fitted_frames import FittedFrames
-from mvest.personalisation.geometry import displacement
-from mvest.personalisation.joint import JointPosterior, damped_step
 from mvest.personalisation.model import CaseClosure, build_model, held_state, with_pressures
 from mvest.personalisation.settings import STIFFENS, PersonaliseSettings, Prior
 from mvest.personalisation.sources import ClosedValve
@@ -42,8 +40,9 @@ ROUGH = 0.05
 LEARNED = 4
 """Iterates in which errors are learned, if the start is an estimate without errors of geometry."""
 
-SETTLED = 0.25
-"""Distance of the moduli from the linearisation point, in standard deviations, that is enough."""
+SETTLED = 0.5
+"""Distance of the moduli from the linearisation point, in standard deviations, that is enough: at
+most 15 % of a modulus, where effects of the geometry are off by some 7 %."""
 
 OnStep = Callable[[float, int], None]
 
@@ -74,7 +73,7 @@ class CaseEstimate:
     result: StudyResult
     point: LinearisationPoint  #: of the last estimate
     #: Largest distance of a modulus from there in standard deviations; None if the geometry was
-    #: linearised about the measured one only.
+    #: linearised once only.
     moved: float | None = None
     #: Why some errors of geometry or law are not in the intervals.
     unaccounted: tuple[str, ...] = ()
@@ -230,8 +229,9 @@ def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstim
     """Estimate all unknowns, with the errors of geometry and law.
 
     The effects of these errors depend on the moduli: at half the modulus, derivatives are off by a
-    quarter. So a rough estimate without them gives the first linearisation point. The generic valve
-    has the effect of the error samples of its case, if there are any.
+    quarter. So a rough estimate without them gives the first linearisation point, and estimates
+    with them give the next ones. The geometry stays the measured one. The generic valve has the
+    effect of the error samples of its case, if there are any.
     """
     settings = problem.settings
     if settings.nuisance_geometry is None and not settings.nuisance_law:
@@ -244,38 +244,35 @@ def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstim
     prediction = generic.closure.shared(at)
     if not prediction.converged:
         return CaseEstimate(rough, generic, unaccounted=(prediction.reason,))
-    plain_errors = FrameErrors(problem.fitted.beside(prediction))
-    point = linearised(LinearisationPoint(generic.closure, plain_errors, at, prediction), problem)
-    moved, unaccounted, first = None, point.errors.unaccounted, point
+    errors = FrameErrors(problem.fitted.beside(prediction))
+    point = linearised(LinearisationPoint(generic.closure, errors, at, prediction))
+    start, why, geometry = at, "", settings.nuisance_geometry
+    renewals = 0 if geometry is None or not point.errors.geometry else geometry.renewals
     if problem.case.error_samples is not None:
-        # The samples describe the geometry, so it has no other posterior mean.
-        point = point.sampled()
-    elif point.errors.geometry:
-        point, moved, more = _relinearised(problem, point)
-        unaccounted = point.errors.unaccounted + more
-    result = _estimate_about(problem, point)
-    if not result.converged and point.errors.displaced_by:
-        reason = f"about the expected geometry: {result.reason} ({result.detail})"
-        point, moved, unaccounted = first, None, (*first.errors.unaccounted, reason)
-        result = _estimate_about(problem, point)
+        # The samples describe most of the geometry.
+        point, renewals = point.sampled(), 0
+    elif renewals:
+        point, start, why = _relinearised(problem, point, renewals)
+    result = _estimate_about(problem, point, start)
+    moved = _distance(problem, result, point) if renewals else None
+    unaccounted = (*point.errors.unaccounted, *((why,) if why else ()))
     result = replace(result, seconds=time.perf_counter() - began)
     return CaseEstimate(result, point, moved, unaccounted)
 
 
-def linearised(point: LinearisationPoint, problem: CaseProblem) -> LinearisationPoint:
+def linearised(point: LinearisationPoint) -> LinearisationPoint:
     """The point with its errors of geometry and law."""
-    seen = problem.stated.model if point.errors.displaced_by else None
-    return replace(point, errors=linearise(point.errors, point.valve, seen))
+    return replace(point, errors=linearise(point.errors, point.valve))
 
 
 def _estimate_about(
-    problem: CaseProblem, point: LinearisationPoint, *, final: bool = True
+    problem: CaseProblem, point: LinearisationPoint, start: FloatArray, *, final: bool = True
 ) -> StudyResult:
-    """Estimate all unknowns, starting at ``point``; the covariance is exact only if ``final``."""
+    """Estimate all unknowns, from ``start (p,)`` on; the covariance is exact only if ``final``."""
     tolerance = problem.settings.tolerance
     filter_ = replace(
         problem.filter(tolerance if final else max(ROUGH, tolerance)),
-        start=tuple(point.m.tolist()),
+        start=tuple(start.tolist()),
         max_learned=LEARNED,
         second_order=final,
     )
@@ -283,118 +280,39 @@ def _estimate_about(
 
 
 def _relinearised(
-    problem: CaseProblem, point: LinearisationPoint
-) -> tuple[LinearisationPoint, float | None, tuple[str, ...]]:
-    """The joint mode of parameters and geometry, by Gauss-Newton steps from ``point``.
+    problem: CaseProblem, point: LinearisationPoint, renewals: int
+) -> tuple[LinearisationPoint, FloatArray, str]:
+    """A linearisation point near its own estimate, that estimate ``(p,)``, and what went wrong.
 
-    Each step displaces the geometry of the closure; the prior of its errors stays about the
-    measured one. Also the distance of the moduli from there (`CaseEstimate.moved`), and why
-    the steps ended early.
+    A step that is not half as long as the last one goes half of the way only: effects of the
+    geometry that are computed for too stiff a leaflet often make its estimate too soft, and
+    conversely.
     """
-    nuisance = problem.settings.nuisance_geometry
-    assert nuisance is not None
-    result, moved, why = None, None, ""
-    for _ in range(nuisance.renewals):
-        before = result or _estimate_about(problem, point, final=False)
-        found = _nearer(problem, before, point)
-        if found is point:
-            return point, _distance(problem, before, point), ()
-        if isinstance(found, str):
-            why = found
+    start, last = point.m, np.inf
+    for _ in range(renewals):
+        result = _estimate_about(problem, point, start, final=False)
+        if result.filtered is None or result.estimate is None:
+            return point, start, f"about the estimate: {result.reason} ({result.detail})"
+        start, moved = result.estimate, _distance(problem, result, point)
+        if moved is None or moved < SETTLED:
             break
-        found = linearised(found, problem)
+        share, last = (0.5 if moved > 0.5 * last else 1.0), moved
+        z = problem.transform.forward(point.m)
+        m = problem.transform.inverse(z + share * (result.filtered.transformed.mean - z))
+        prediction = point.closure.shared(m)
+        if not prediction.converged:
+            return point, start, f"about the estimate: {prediction.reason}"
+        found = linearised(replace(point, m=m, prediction=prediction))
         if not found.errors.geometry:
-            why = "; ".join(found.errors.unaccounted)
-            break
-        trial = _estimate_about(problem, found, final=False)
-        # Out of iterations, it still leads on: a next point must be more probable than this one.
-        unfinished = trial.filtered is not None and trial.filtered.reason is Reason.MAX_ITERATIONS
-        if not (trial.converged or unfinished):
-            why = f"{trial.reason} ({trial.detail})"
-            break
-        point, result = found, trial
-        moved = _distance(problem, result, point)
-        if moved < SETTLED:
-            break
-    return point, moved, (f"about the expected geometry: {why}",) if why else ()
+            return point, start, "; ".join(found.errors.unaccounted)
+        point = found
+    return point, start, ""
 
 
-def _distance(problem: CaseProblem, result: StudyResult, point: LinearisationPoint) -> float:
+def _distance(problem: CaseProblem, result: StudyResult, point: LinearisationPoint) -> float | None:
     """Largest distance of an estimated modulus from a point, in standard deviations."""
-    assert result.filtered is not None
+    if result.filtered is None:
+        return None
     found, z = result.filtered.transformed, problem.transform.forward(point.m)
     moduli = problem.moduli
     return float(np.max(np.abs(found.mean - z)[moduli] / found.std[moduli]))
-
-
-def _nearer(
-    problem: CaseProblem, result: StudyResult, point: LinearisationPoint
-) -> LinearisationPoint | str:
-    """A more probable point towards the estimate and its expected geometry, or why there is none.
-
-    ``point`` itself if it is as good.
-    """
-    filtered, residual = result.filtered, result.residual
-    posterior = joint(problem, result, point.errors)
-    if posterior is None or filtered is None or residual is None:
-        return result.reason
-    z, H = filtered.transformed.mean, slopes(filtered)
-    # A filter stops before its last small step; this step takes it.
-    end = posterior.step(z, residual, H)
-    residual = residual - H @ (end - z)
-    modes = posterior.expected(residual)
-    begin = problem.transform.forward(point.m)
-    was = point.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
-    here = posterior.misfit_at(point.m, point.prediction, point.errors.displaced_by)
-    offset = point.errors.offset(modes)
-    predicted = here - posterior.misfit(end, residual - offset, modes)
-
-    def trial(share: float) -> tuple[float, LinearisationPoint] | str:
-        return _displaced(
-            problem,
-            tuple(a + share * (b - a) for a, b in zip(was, modes, strict=True)),
-            problem.transform.inverse(begin + share * (end - begin)),
-            posterior,
-        )
-
-    found = damped_step(trial, here, predicted)
-    if found == "" and predicted < SETTLED**2:
-        # To first order the gain is the squared distance in standard deviations.
-        return point
-    return found or "no step towards it fits the observation better"
-
-
-def joint(problem: CaseProblem, result: StudyResult, errors: FrameErrors) -> JointPosterior | None:
-    """Of parameters and geometry about an estimate; None without either."""
-    filtered = result.filtered
-    if filtered is None or filtered.prediction is None or not errors.geometry:
-        return None
-    prior = to_filter(problem.transform, problem.prior)
-    measured = errors.measured()
-    return JointPosterior(prior, problem.transform, measured, errors, filtered.learned)
-
-
-def _displaced(
-    problem: CaseProblem, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior
-) -> tuple[float, LinearisationPoint] | str:
-    """Misfit and point of the valve displaced by modes, or why it does not close.
-
-    It is closed at ``m (p,)``, then with the best parameters for this geometry.
-    """
-    kinds = [source.modes for source in posterior.errors.geometry if source.modes is not None]
-    try:
-        closure = problem.stated.displaced(displacement(kinds, modes), m)
-    except GeometryError as error:  # a leaflet without thickness, a mesh that is torn
-        return str(error)
-    first = closure.shared(m)
-    if not first.converged:
-        return first.reason
-    errors = posterior.errors.displaced(modes)
-    better = posterior.refitted(m, first)
-    again = predict(closure.shared, better)
-    tried = [(m, first), (better, again)] if again.converged else [(m, first)]
-    found = [
-        (posterior.misfit_at(at, y, modes), LinearisationPoint(closure, errors, at, y))
-        for at, y in tried
-    ]
-    return min(found, key=lambda one: one[0])

@@ -55,8 +55,8 @@ class NuisanceGeometry:
     factor: Factor = 2.0
     #: Share of the variance that smooth modes represent; finer modes are dropped.
     share: Share = 0.9
-    #: How often, at most, the geometry is relinearised about its posterior mean instead of the
-    #: measured one. Each takes somewhat less time than the estimate.
+    #: How often, at most, the effects of the geometry are computed anew, with the parameters that
+    #: were estimated. Each takes somewhat less time than the estimate.
     renewals: Count = 0
 
     def __post_init__(self) -> None:

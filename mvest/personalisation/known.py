@@ -21,7 +21,7 @@ from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
 from mvest.personalisation.errors import FrameErrors
-from mvest.personalisation.estimation import CaseEstimate, CaseProblem, joint, slopes
+from mvest.personalisation.estimation import CaseEstimate, CaseProblem, slopes
 from mvest.personalisation.geometry import displacement
 from mvest.personalisation.sources import LAW
 from mvest.problem.record import Row
@@ -394,10 +394,11 @@ def geometry_shifts(problem: CaseProblem, estimate: CaseEstimate) -> Iterator[Ro
     known, or described by error samples.
     """
     errors, result = estimate.point.errors, estimate.result
-    posterior, residual = joint(problem, result, errors), result.residual
-    if posterior is None or residual is None or errors.samples is not None:
+    residual, filtered = result.residual, result.filtered
+    if residual is None or filtered is None or errors.samples is not None:
         return
-    expected, scales = posterior.expected(residual), errors.geometry_sizes(posterior.learned)
+    expected = expected_modes(errors, filtered.learned, residual)
+    scales = errors.geometry_sizes(filtered.learned)
     for source, modes, scale in zip(errors.geometry, expected, scales, strict=True):
         assert source.modes is not None
         # Later parts follow from the first, as rest lengths follow from the tips.
@@ -408,6 +409,22 @@ def geometry_shifts(problem: CaseProblem, estimate: CaseEstimate) -> Iterator[Ro
         size = factor * float(np.sqrt(np.mean(square)))
         stretch = float(np.max(np.abs(modes)) / scale)
         yield {"name": source.name, "unit": unit, "size": size, "stretch": stretch}
+
+
+def expected_modes(
+    errors: FrameErrors, learned: LearnedNoise | None, residual: FloatArray
+) -> tuple[FloatArray, ...]:
+    """Most probable amplitudes ``(q,)`` of the geometry's modes by kind, for known parameters.
+
+    For the residual ``(k,)`` there, with s the learned size of a kind: ``s² Cᵀ S⁻¹ r`` with the
+    covariance S of all errors.
+    """
+    noise = errors.noise(learned)
+    white, sizes = noise.whiten(residual), errors.geometry_sizes(learned)
+    return tuple(
+        s**2 * (noise.whiten(own.rows).T @ white)
+        for s, own in zip(sizes, errors.geometry, strict=True)
+    )
 
 
 def law_share(estimate: CaseEstimate) -> float | None:

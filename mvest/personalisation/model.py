@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import numpy as np
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
-from mvest.closure.rest_geometry import RestGeometry
 from mvest.closure.robustness import GATE_CASES, GateReport, run_gate, vary
 from mvest.errors import InputError
 from mvest.estimation.prediction import SharedStart
@@ -125,8 +123,6 @@ class CaseClosure:
     frames: FramesModel | None  #: all fitted closed frames, if there are several
     registered: RegisteredModel  #: the same, with the rigid displacement of the observed frames
     shared: SharedStart  #: the same, for many estimations
-    #: Part -> difference from the measured geometry; see `RestGeometry.displaced`.
-    displacement: Mapping[str, FloatArray]
 
     @classmethod
     def of(
@@ -135,32 +131,10 @@ class CaseClosure:
         frames: FramesModel | None,
         names: tuple[str, ...],
         start: FloatArray,
-        displacement: Mapping[str, FloatArray] | None = None,
     ) -> CaseClosure:
         """The closure of a valve, starting at ``start (p,)`` in the order of ``names``."""
         registered = RegisteredModel(frames or model, names)
-        return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
-
-    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> CaseClosure:
-        """Closure of the valve with another geometry, see `RestGeometry.displaced`.
-
-        All closed frames have the same errors of annulus and tips, as in their derivatives.
-        """
-        model, names = RestGeometry(self.model).displaced(parts), self.registered.names
-        closure = self.of(model, self.frames, names, start, parts)
-        if self.frames is None:
-            return closure
-        states = {name: closure.held(state) for name, state in self.frames.states.items()}
-        frames = replace(self.frames, model=model, states=states)
-        return self.of(model, frames, names, start, parts)
-
-    def held(self, state: HeldState) -> HeldState:
-        """A measured state with the displaced annulus and tips of this valve."""
-        return replace(
-            state,
-            annulus=state.annulus + self.displacement.get("annulus", 0.0),
-            papillary_tips=state.papillary_tips + self.displacement.get("tips", 0.0),
-        )
+        return cls(model, frames, registered, SharedStart(registered, start))
 
 
 def gate_case(

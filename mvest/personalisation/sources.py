@@ -95,7 +95,6 @@ def geometry_sources(
     valve: ClosedValve,
     observation: Observed,
     noise: ObservationNoise,
-    seen: ClosureModel | None = None,
 ) -> tuple[ErrorSource, ...] | str:
     """Errors of an observation by those of the geometry, by kind, or why they are unknown.
 
@@ -105,13 +104,11 @@ def geometry_sources(
         Of the case.
     noise : ObservationNoise
         Of single observations, as stated.
-    seen : ClosureModel, optional
-        Of the measured geometry, if that of ``valve`` is displaced.
     """
     if not modes:
         return ()
     model, at, states = valve.closure()
-    geometry = RestGeometry(model, seen)
+    geometry = RestGeometry(model)
     joined = RestVariation.joined([geometry.variation(own.parts) for own in modes])
     change = geometry.change(at, joined, states, TOLERANCE)
     if isinstance(change, str):

@@ -20,6 +20,7 @@ from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import Step
 from mvest.mechanics.valve_system import boundary_loading, build_system, patch_members
 from mvest.valve.mesh.solid_mesh import embed
+from tests.closure.displaced import displaced as displaced_model
 from tests.closure.test_model import AT, CLOSING, OPEN, model_of
 
 PARTS = {
@@ -141,7 +142,7 @@ def test_a_valve_with_another_geometry_closes_as_its_derivative_says(closed, par
     exact = geometry.change(AT, geometry.variation({part: move[None]}))[1, ..., 0]
     ends = []
     for step in (2e-3, -2e-3):
-        model = geometry.displaced({part: step * move})
+        model = displaced_model(geometry, {part: step * move})
         model.restart(ClosedState(AT, start))
         simulation = model.close(AT, sensitivities=False).simulation
         assert simulation.converged

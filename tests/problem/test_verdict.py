@@ -134,5 +134,5 @@ def test_checks_without_data_are_missing_and_do_not_count_as_passed():
 def test_two_doubtful_checks_are_none_and_two_findings_of_one_are_doubtful():
     smooth = {"correlation": one(0.5, correlation=0.5)}
     assert judge(GOOD | smooth).trust == DOUBTFUL
-    assert judge(GOOD | smooth | {"moved": one(1.0)}).trust == NONE
+    assert judge(GOOD | smooth | {"moved": one(1.5)}).trust == NONE
     assert judge(GOOD | {"implausible": texts("thick", "wide")}).trust == DOUBTFUL
