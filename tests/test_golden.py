@@ -119,7 +119,7 @@ RUNS = {
     "own_valve_coarse": Run("case", (*OWN, "personal=carried", *COARSE)),
     "own_valve": Run("case", (*OWN, STRUCTURED), slow=True),
     "patients_coarse": Run("patient", (*PATIENT, "personal=nuisances", *SMALL_PATIENT, *COARSE)),
-    "patients": Run("patient", PATIENT, slow=True),
+    "patients": Run("case", PATIENT, slow=True),
     "population": Run(
         "patient",
         ("experiment=population", "patient=drawn", "seed=601", "hydra.mode=RUN"),

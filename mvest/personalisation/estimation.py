@@ -246,15 +246,16 @@ def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstim
         return CaseEstimate(rough, generic, unaccounted=(prediction.reason,))
     errors = FrameErrors(problem.fitted.beside(prediction))
     point = linearised(LinearisationPoint(generic.closure, errors, at, prediction))
-    start, why, geometry = at, "", settings.nuisance_geometry
-    renewals = 0 if geometry is None or not point.errors.geometry else geometry.renewals
+    geometry, why, moved = settings.nuisance_geometry, "", None
+    start, renewals = at, 0 if geometry is None or not point.errors.geometry else geometry.renewals
     if problem.case.error_samples is not None:
         # The samples describe most of the geometry.
         point, renewals = point.sampled(), 0
     elif renewals:
         point, start, why = _relinearised(problem, point, renewals)
     result = _estimate_about(problem, point, start)
-    moved = _distance(problem, result, point) if renewals else None
+    if renewals and result.filtered is not None:
+        moved = _distance(problem, result, point)
     unaccounted = (*point.errors.unaccounted, *((why,) if why else ()))
     result = replace(result, seconds=time.perf_counter() - began)
     return CaseEstimate(result, point, moved, unaccounted)
@@ -284,35 +285,34 @@ def _relinearised(
 ) -> tuple[LinearisationPoint, FloatArray, str]:
     """A linearisation point near its own estimate, that estimate ``(p,)``, and what went wrong.
 
-    A step that is not half as long as the last one goes half of the way only: effects of the
-    geometry that are computed for too stiff a leaflet often make its estimate too soft, and
-    conversely.
+    Each step goes to the estimate about the last point, while estimates come nearer to their
+    points. They need not: effects of the geometry that are computed for too stiff a leaflet may
+    make its estimate too soft, and conversely.
     """
-    start, last = point.m, np.inf
-    for _ in range(renewals):
-        result = _estimate_about(problem, point, start, final=False)
+    start, nearest = point.m, np.inf
+    following = point
+    for k in range(renewals + 1):
+        result = _estimate_about(problem, following, start, final=False)
         if result.filtered is None or result.estimate is None:
             return point, start, f"about the estimate: {result.reason} ({result.detail})"
-        start, moved = result.estimate, _distance(problem, result, point)
-        if moved is None or moved < SETTLED:
+        moved = _distance(problem, result, following)
+        if moved >= nearest:
             break
-        share, last = (0.5 if moved > 0.5 * last else 1.0), moved
-        z = problem.transform.forward(point.m)
-        m = problem.transform.inverse(z + share * (result.filtered.transformed.mean - z))
-        prediction = point.closure.shared(m)
+        point, start, nearest = following, result.estimate, moved
+        if moved < SETTLED or k == renewals:
+            break
+        prediction = point.closure.shared(start)
         if not prediction.converged:
             return point, start, f"about the estimate: {prediction.reason}"
-        found = linearised(replace(point, m=m, prediction=prediction))
-        if not found.errors.geometry:
-            return point, start, "; ".join(found.errors.unaccounted)
-        point = found
+        following = linearised(replace(point, m=start, prediction=prediction))
+        if not following.errors.geometry:
+            return point, start, "; ".join(following.errors.unaccounted)
     return point, start, ""
 
 
-def _distance(problem: CaseProblem, result: StudyResult, point: LinearisationPoint) -> float | None:
+def _distance(problem: CaseProblem, result: StudyResult, point: LinearisationPoint) -> float:
     """Largest distance of an estimated modulus from a point, in standard deviations."""
-    if result.filtered is None:
-        return None
+    assert result.filtered is not None
     found, z = result.filtered.transformed, problem.transform.forward(point.m)
     moduli = problem.moduli
     return float(np.max(np.abs(found.mean - z)[moduli] / found.std[moduli]))

@@ -410,5 +410,5 @@ STUDY = Study(
     keep_arrays=keep_arrays,
     keeps_failures=True,
     check=check_patient,
-    golden=("patient",),
+    golden=("case", "patient"),
 )
