@@ -89,9 +89,7 @@ def personalise(
         learned = None if result.filtered is None else result.filtered.learned
         closed = closed_details(at.valve, at.errors, learned)
         found = replace(found, details={**found.details, **closed})
-    stated = LinearisationPoint(
-        problem.stated, point.errors.as_stated(), generic.m, generic.prediction
-    )
+    stated = replace(generic, errors=point.errors.as_stated())
     return replace(found, alternatives=problem.alternatives(stated))
 
 

@@ -169,11 +169,6 @@ class FrameErrors:
         """Expected error ``(k,)`` of the prediction by law and mesh."""
         return sum((source.expected for source in self.sources), start=0.0)
 
-    def measured(self) -> Observed:
-        """The fitted frames with their stated noise, and with the prediction's expected error."""
-        plain = self.fitted.observation()
-        return WeighedObservation(plain, plain.R, self.expected)
-
     def rough_observation(self) -> Observed:
         """The same with blurred surfaces, for a first estimate."""
         observation = self.observation()

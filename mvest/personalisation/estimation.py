@@ -91,7 +91,7 @@ class CaseProblem:
     prior: Gaussian  #: of these
     transform: Log
     fitted: FittedFrames
-    stated: CaseClosure  #: of the valve as the case states it
+    closure: CaseClosure
     on_iterate: OnIterate | None = None
 
     @classmethod
@@ -135,10 +135,10 @@ class CaseProblem:
             states = {frame.name: held_state(model, frame) for frame in ordered}
             errors = tuple(u.name for u in settings.unknowns if is_frame_pressure(u.name))
             several = FramesModel(model, closed.name, states, closed.pressure_mmHg, errors)
-        stated = CaseClosure.of(model, several, tuple(u.name for u in unknowns), start)
+        closure = CaseClosure.of(model, several, tuple(u.name for u in unknowns), start)
         names = None if several is None else several.frames
         fitted = FittedFrames(case, settings, model.valve, names)
-        return cls(case, settings, unknowns, prior, transform, fitted, stated, on_iterate)
+        return cls(case, settings, unknowns, prior, transform, fitted, closure, on_iterate)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -152,10 +152,10 @@ class CaseProblem:
 
     def generic(self) -> LinearisationPoint:
         """The generic valve, where every estimation starts; nothing is linearised yet."""
-        start = self.stated.shared.start
-        prediction = self.stated.shared(start)
+        start = self.closure.shared.start
+        prediction = self.closure.shared(start)
         errors = FrameErrors(self.fitted.beside(prediction))
-        return LinearisationPoint(self.stated, errors, start, prediction)
+        return LinearisationPoint(self.closure, errors, start, prediction)
 
     def filter(self, tolerance: float) -> IteratedFilter:
         """The filter of all unknowns, to a relative tolerance."""
@@ -246,17 +246,18 @@ def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstim
         return CaseEstimate(rough, generic, unaccounted=(prediction.reason,))
     errors = FrameErrors(problem.fitted.beside(prediction))
     point = linearised(LinearisationPoint(generic.closure, errors, at, prediction))
-    geometry, why, moved = settings.nuisance_geometry, "", None
-    start, renewals = at, 0 if geometry is None or not point.errors.geometry else geometry.renewals
+    geometry, start, moved = settings.nuisance_geometry, at, None
+    unaccounted = point.errors.unaccounted
+    renewals = geometry.renewals if geometry is not None and point.errors.geometry else 0
     if problem.case.error_samples is not None:
         # The samples describe most of the geometry.
         point, renewals = point.sampled(), 0
     elif renewals:
-        point, start, why = _relinearised(problem, point, renewals)
+        point, start, more = _relinearised(problem, point, renewals)
+        unaccounted = (*point.errors.unaccounted, *more)
     result = _estimate_about(problem, point, start)
     if renewals and result.filtered is not None:
         moved = _distance(problem, result, point)
-    unaccounted = (*point.errors.unaccounted, *((why,) if why else ()))
     result = replace(result, seconds=time.perf_counter() - began)
     return CaseEstimate(result, point, moved, unaccounted)
 
@@ -282,19 +283,18 @@ def _estimate_about(
 
 def _relinearised(
     problem: CaseProblem, point: LinearisationPoint, renewals: int
-) -> tuple[LinearisationPoint, FloatArray, str]:
+) -> tuple[LinearisationPoint, FloatArray, tuple[str, ...]]:
     """A linearisation point near its own estimate, that estimate ``(p,)``, and what went wrong.
 
     Each step goes to the estimate about the last point, while estimates come nearer to their
     points. They need not: effects of the geometry that are computed for too stiff a leaflet may
     make its estimate too soft, and conversely.
     """
-    start, nearest = point.m, np.inf
-    following = point
+    following, start, nearest = point, point.m, np.inf
     for k in range(renewals + 1):
         result = _estimate_about(problem, following, start, final=False)
         if result.filtered is None or result.estimate is None:
-            return point, start, f"about the estimate: {result.reason} ({result.detail})"
+            return point, start, (f"about the estimate: {result.reason} ({result.detail})",)
         moved = _distance(problem, result, following)
         if moved >= nearest:
             break
@@ -303,11 +303,11 @@ def _relinearised(
             break
         prediction = point.closure.shared(start)
         if not prediction.converged:
-            return point, start, f"about the estimate: {prediction.reason}"
+            return point, start, (f"about the estimate: {prediction.reason}",)
         following = linearised(replace(point, m=start, prediction=prediction))
         if not following.errors.geometry:
-            return point, start, "; ".join(following.errors.unaccounted)
-    return point, start, ""
+            return point, start, following.errors.unaccounted
+    return point, start, ()
 
 
 def _distance(problem: CaseProblem, result: StudyResult, point: LinearisationPoint) -> float:
