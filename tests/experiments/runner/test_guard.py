@@ -6,6 +6,8 @@ import signal
 import sys
 import threading
 from pathlib import Path
+from queue import SimpleQueue
+from types import SimpleNamespace
 
 import pytest
 
@@ -141,15 +143,14 @@ def test_a_damaged_or_changed_result_is_none(worker, tmp_path, content):
     assert run_in(worker, request(tmp_path, exit=3)).status == "failed"
 
 
-def test_who_finds_the_folder_locked_waits_and_says_so(tmp_path, capsys):
+def test_who_finds_the_folder_locked_waits_and_says_so(tmp_path, monkeypatch):
+    said = SimpleQueue()
+    monkeypatch.setattr(sys, "stderr", SimpleNamespace(write=said.put, flush=lambda: None))
     first = lock(tmp_path)
     second = threading.Thread(target=lambda: lock(tmp_path).lock.release())
     second.start()
-    waits = f"waiting for another process that works in {tmp_path}\n"
-    said = ""
-    while not said:
-        said = capsys.readouterr().err
-    assert said == waits
+    text, end = said.get(timeout=60), said.get(timeout=60)
+    assert text + end == f"waiting for another process that works in {tmp_path}\n"
     assert second.is_alive()
     first.lock.release()
     second.join(60)
