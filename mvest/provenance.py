@@ -38,7 +38,8 @@ and patients close without coarser meshes, and the pressure of a volume has a pr
 generation 3 the expected error of the mesh is taken from the observation, and the detectors are
 trained on the valves of generation 2; in generations 4 and 5 (cases only) closures succeed that
 failed; in generation 6 (cases only) assumed fibres turn as the template's, and errors of free edges
-are correlated; in generation 7 (cases only) the geometry stays the measured one.
+are correlated; in generation 7 (cases only) the geometry stays the measured
+one, and errors of surfaces are correlated over a valve near them.
 """
 
 GOLDEN = {

@@ -254,7 +254,7 @@ def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstim
         point, renewals = point.sampled(), 0
     elif renewals:
         point, start, more = _relinearised(problem, point, renewals)
-        unaccounted = (*point.errors.unaccounted, *more)
+        unaccounted = tuple(dict.fromkeys((*point.errors.unaccounted, *more)))
     result = _estimate_about(problem, point, start)
     if renewals and result.filtered is not None:
         moved = _distance(problem, result, point)

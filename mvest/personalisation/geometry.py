@@ -86,7 +86,7 @@ class GeometryModes:
 def displacement(
     modes: Sequence[GeometryModes], sizes: Sequence[FloatArray]
 ) -> dict[str, FloatArray]:
-    """Change of a geometry by amplitudes ``(q,)`` of each kind, for `RestGeometry.displaced`."""
+    """Change of each part of a geometry by amplitudes ``(q,)`` of each kind."""
     total: dict[str, FloatArray] = {}
     for own, z in zip(modes, sizes, strict=True):
         for part, moves in own.parts.items():
