@@ -14,13 +14,7 @@ from mvest.estimation.prediction import Prediction
 from mvest.observation.surfaces import surface_distance
 from mvest.personalisation.calibration import calibration_for
 from mvest.personalisation.closed import closed_details
-from mvest.personalisation.estimation import (
-    CaseEstimate,
-    CaseProblem,
-    LinearisationPoint,
-    OnStep,
-    estimate_all,
-)
+from mvest.personalisation.estimation import CaseEstimate, CaseProblem, OnStep, estimate_all
 from mvest.personalisation.known import known_of, law_share
 from mvest.personalisation.model import held_state
 from mvest.personalisation.result import FrameComparison, Personalised
@@ -62,13 +56,13 @@ def personalise(
         if case.error_samples is not None:
             generic = generic.sampled()
         # Held-out frames start from the last closed valve, so they come before other closures.
-        before = predicted_frames(problem, generic, generic.m, generic.prediction.y)
+        before = predicted_frames(problem, generic.m, generic.prediction.y)
     estimate = estimate_all(problem, generic)
     result, point = estimate.result, estimate.point
     found = Personalised(
         case=case,
         settings=problem.settings,
-        mesh=point.closure.model.mesh,
+        mesh=problem.closure.model.mesh,
         result=result,
         alternatives={},
         error_samples=0 if point.errors.frame_samples is None else len(point.errors.frame_samples),
@@ -77,7 +71,7 @@ def personalise(
         calibration=calibration,
     )
     if before and result.estimate is not None and result.fitted is not None:
-        after = predicted_frames(problem, point, result.estimate, result.fitted)
+        after = predicted_frames(problem, result.estimate, result.fitted)
         found = replace(
             found,
             frames=compare_frames(problem, before, after),
@@ -85,7 +79,9 @@ def personalise(
             law_share=law_share(estimate),
             confirmed_mm=largest_difference_anew(problem, estimate) if settings.confirm else None,
         )
-        at = replace(point, m=result.estimate, prediction=point.closure.registered(result.estimate))
+        at = replace(
+            point, m=result.estimate, prediction=problem.closure.registered(result.estimate)
+        )
         learned = None if result.filtered is None else result.filtered.learned
         closed = closed_details(at.valve, at.errors, learned)
         found = replace(found, details={**found.details, **closed})
@@ -94,14 +90,13 @@ def personalise(
 
 
 def predicted_frames(
-    problem: CaseProblem, point: LinearisationPoint, m: FloatArray, closed: FloatArray
+    problem: CaseProblem, m: FloatArray, closed: FloatArray
 ) -> dict[str, FloatArray]:
     """Predicted vertices ``(n, 3)`` mm of all fitted and held-out frames, as observed.
 
-    The closure of ``point`` predicts. ``closed`` are the predicted frames at ``m (p,)``, stacked,
-    the closed one last.
+    ``closed`` are the predicted frames at ``m (p,)``, stacked, the closed one last.
     """
-    closure, fitted, case = point.closure, problem.fitted, problem.case
+    closure, fitted, case = problem.closure, problem.fitted, problem.case
     shown = closed.reshape(-1, len(case.surface.vertices), 3)[-len(fitted.frames) :]
     frames = {frame.name: points for frame, points in zip(fitted.frames, shown, strict=True)}
     further = {frame.name: held_state(closure.model, frame) for frame in case.held_out}
@@ -151,7 +146,7 @@ def largest_difference_anew(problem: CaseProblem, estimate: CaseEstimate) -> flo
 
     Both on the guide mesh if there is one. None if one of them does not close.
     """
-    closure, m = estimate.point.closure, estimate.result.estimate
+    closure, m = problem.closure, estimate.result.estimate
     assert m is not None
     model = closure.model.guide or closure.model
     anew = replace(model, continuation=False, guide=None, repeat=True)

@@ -31,7 +31,7 @@ from mvest.personalisation.model import CaseClosure, build_model, held_state, wi
 from mvest.personalisation.settings import STIFFENS, PersonaliseSettings, Prior
 from mvest.personalisation.sources import ClosedValve
 from mvest.problem.estimate import Observed, Problem, StudyResult, estimate
-from mvest.problem.registration import REGISTRATION
+from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import FloatArray
 
 ROUGH = 0.05
@@ -51,7 +51,7 @@ OnStep = Callable[[float, int], None]
 class LinearisationPoint:
     """A closed valve, with its parameters ``m (p,)``, prediction and linearised errors."""
 
-    closure: CaseClosure
+    registered: RegisteredModel
     errors: FrameErrors
     m: FloatArray
     prediction: Prediction
@@ -59,7 +59,7 @@ class LinearisationPoint:
     @property
     def valve(self) -> ClosedValve:
         """The valve for `linearise`."""
-        return ClosedValve(self.closure.registered, self.m, self.prediction.y)
+        return ClosedValve(self.registered, self.m, self.prediction.y)
 
     def sampled(self) -> LinearisationPoint:
         """The point with the effect of the error samples of its case."""
@@ -155,7 +155,7 @@ class CaseProblem:
         start = self.closure.shared.start
         prediction = self.closure.shared(start)
         errors = FrameErrors(self.fitted.beside(prediction))
-        return LinearisationPoint(self.closure, errors, start, prediction)
+        return LinearisationPoint(self.closure.registered, errors, start, prediction)
 
     def filter(self, tolerance: float) -> IteratedFilter:
         """The filter of all unknowns, to a relative tolerance."""
@@ -164,8 +164,8 @@ class CaseProblem:
     def estimate(
         self, point: LinearisationPoint, filter_: Filter, observation: Observed
     ) -> StudyResult:
-        """All unknowns by one run of a filter, with the closure and the errors of a point."""
-        model, tissue = point.closure.shared, self.settings.mechanics.tissue
+        """All unknowns by one run of a filter, with the errors of a point."""
+        model, tissue = self.closure.shared, self.settings.mechanics.tissue
         whole = Problem(self.names, model, self.prior, filter_, self.transform, tissue)
         return self._estimated(point, whole, observation)
 
@@ -175,7 +175,7 @@ class CaseProblem:
         ``moduli_only`` and ``paper`` (by the paper's filter with its independent R), as the
         settings request. Tissue does not stiffen.
         """
-        settings, moduli, shared = self.settings, np.array(self.moduli), point.closure.shared
+        settings, moduli, shared = self.settings, np.array(self.moduli), self.closure.shared
         found: dict[str, StudyResult] = {}
         stiffens = [u.name.startswith(STIFFENS) for u in self.unknowns]
         known = np.where(stiffens, 0.0, shared.start)
@@ -241,11 +241,11 @@ def estimate_all(problem: CaseProblem, generic: LinearisationPoint) -> CaseEstim
     filter_ = problem.filter(max(ROUGH, settings.tolerance))
     rough = problem.estimate(generic, filter_, generic.errors.rough_observation())
     at = generic.m if rough.estimate is None else rough.estimate
-    prediction = generic.closure.shared(at)
+    prediction = problem.closure.shared(at)
     if not prediction.converged:
         return CaseEstimate(rough, generic, unaccounted=(prediction.reason,))
     errors = FrameErrors(problem.fitted.beside(prediction))
-    point = linearised(LinearisationPoint(generic.closure, errors, at, prediction))
+    point = linearised(replace(generic, errors=errors, m=at, prediction=prediction))
     geometry, start, moved = settings.nuisance_geometry, at, None
     unaccounted = point.errors.unaccounted
     renewals = geometry.renewals if geometry is not None and point.errors.geometry else 0
@@ -301,7 +301,7 @@ def _relinearised(
         point, start, nearest = following, result.estimate, moved
         if moved < SETTLED or k == renewals:
             break
-        prediction = point.closure.shared(start)
+        prediction = problem.closure.shared(start)
         if not prediction.converged:
             return point, start, (f"about the estimate: {prediction.reason}",)
         following = linearised(replace(point, m=start, prediction=prediction))
