@@ -161,8 +161,11 @@ class ClosureModel:
 
         The system is built once and belongs to the model.
 
-        MaterialError if a modulus is inadmissible.
+        MaterialError if a modulus is inadmissible, or a parameter not finite.
         """
+        if not np.isfinite(m).all():
+            given = dict(zip(self.names, m.tolist(), strict=True))
+            raise MaterialError(f"parameters {given}: expected finite numbers")
         values = self._values(m)
         if self._system is None:
             self._system = build_system(

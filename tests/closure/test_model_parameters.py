@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mvest.closure.continuation import ClosedState, Coordinates
-from mvest.errors import InputError
+from mvest.errors import InputError, MaterialError
 from mvest.mechanics.parameters import KINDS
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ModulusField
 from tests.closure.test_model import (
@@ -123,6 +123,12 @@ def test_factors_of_all_chordae_and_of_some_multiply():
 def test_names_that_the_valve_does_not_have_are_refused_before_anything_is_closed(name, message):
     with pytest.raises(InputError, match=message):
         model_of(OPEN, (*MODULI, name), **TINY, settings=FIELDS).close(np.array([*AT, 1.0]))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_parameter_that_is_not_finite_is_refused(value):
+    with pytest.raises(MaterialError, match="chord_stiffness.*finite"):
+        model_of(CLOSING, (*MODULI, "chord_stiffness"), **TINY).close(np.array([*AT, value]))
 
 
 def test_the_way_to_other_coefficients_is_measured_in_the_logarithm_of_the_modulus():
