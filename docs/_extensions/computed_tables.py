@@ -1,14 +1,15 @@
 """Directives for tables computed from code, configuration and ``results/``.
 
-``{parameter-table}``, ``{setting-groups}``, ``{setting-ranges}``, ``{sweep-list}``,
-``{believed-failures}`` and ``{believed-table}`` take no options and no content. The role
-``{result}`` shows one number of the results (see `experiments.results.quoted`).
+``{parameter-table}``, ``{check-table}``, ``{setting-groups}``, ``{setting-ranges}``,
+``{sweep-list}``, ``{believed-failures}`` and ``{believed-table}`` take no options and no content.
+The role ``{result}`` shows one number of the results (see `experiments.results.quoted`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass, replace
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
 
@@ -26,6 +27,7 @@ from experiments.results.quoted import quoted
 from experiments.results.renewal import configured
 from mvest.errors import InputError
 from mvest.mechanics.parameters import KINDS
+from mvest.problem.verdict import CHECKS
 from mvest.quantities import Within
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,6 +60,19 @@ def parameter_table() -> str:
             ]
         )
     return markdown(["name", "meaning", "unit", "positive"], rows)
+
+
+def check_table() -> str:
+    """All checks of an estimate, with their limits and what to do if one fails."""
+
+    def shown(limit: float) -> str:
+        return {0.0: "any", inf: "–"}.get(limit, f"{limit:g}")
+
+    rows = [
+        [check.name, check.value, *map(shown, check.limits), check.advice.replace("{what}", "it")]
+        for check in CHECKS.values()
+    ]
+    return markdown(["check", "value", "doubtful above", "none above", "if it fails"], rows)
 
 
 def setting_groups() -> str:
@@ -156,6 +171,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_role("result", result)
     for table in (
         parameter_table,
+        check_table,
         setting_groups,
         setting_ranges,
         sweep_list,

@@ -127,7 +127,7 @@ def test_names_that_the_valve_does_not_have_are_refused_before_anything_is_close
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_parameter_that_is_not_finite_is_refused(value):
-    with pytest.raises(MaterialError, match="chord_stiffness.*finite"):
+    with pytest.raises(MaterialError, match=r"chord_stiffness.*finite"):
         model_of(CLOSING, (*MODULI, "chord_stiffness"), **TINY).close(np.array([*AT, value]))
 
 
