@@ -1,7 +1,8 @@
 """Directives for tables computed from code, configuration and ``results/``.
 
-``{parameter-table}``, ``{check-table}``, ``{setting-groups}``, ``{setting-ranges}``,
-``{sweep-list}``, ``{believed-failures}`` and ``{believed-table}`` take no options and no content.
+``{parameter-table}``, ``{check-table}``, ``{unknown-table}``, ``{personal-choices}``,
+``{setting-groups}``, ``{setting-ranges}``, ``{sweep-list}``, ``{believed-failures}`` and
+``{believed-table}`` take no options and no content.
 The role ``{result}`` shows one number of the results (see `experiments.results.quoted`).
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass, replace
+from itertools import takewhile
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
@@ -16,6 +18,7 @@ from typing import Annotated, Any, get_args, get_origin
 from docutils import nodes
 from docutils.parsers.rst.states import Inliner
 from docutils.statemachine import StringList
+from omegaconf import OmegaConf
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
@@ -27,6 +30,7 @@ from experiments.results.quoted import quoted
 from experiments.results.renewal import configured
 from mvest.errors import InputError
 from mvest.mechanics.parameters import KINDS
+from mvest.problem.registration import unit_of
 from mvest.problem.verdict import CHECKS
 from mvest.quantities import Within
 
@@ -73,6 +77,26 @@ def check_table() -> str:
         for check in CHECKS.values()
     ]
     return markdown(["check", "value", "doubtful above", "none above", "if it fails"], rows)
+
+
+def unknown_table() -> str:
+    """The unknowns of a case with their priors."""
+    unknowns = OmegaConf.load(ROOT / "conf/personal/nuisances.yaml").unknowns
+    rows = [
+        [f"`{name}`", f"{prior.mean:g}", f"{prior.std:g}", unit_of(name) or "–"]
+        for name, prior in unknowns.items()
+    ]
+    return markdown(["unknown", "mean", "standard deviation", "unit"], rows)
+
+
+def personal_choices() -> str:
+    """The files of ``conf/personal`` with the comments at their heads."""
+    rows = []
+    for path in sorted((ROOT / "conf/personal").glob("*.yaml")):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        head = takewhile(lambda line: line.startswith("#"), lines)
+        rows.append([f"`{path.stem}`", " ".join(line.removeprefix("# ") for line in head)])
+    return markdown(["`personal=`", "what it is"], rows)
 
 
 def setting_groups() -> str:
@@ -172,6 +196,8 @@ def setup(app: Sphinx) -> dict[str, bool]:
     for table in (
         parameter_table,
         check_table,
+        unknown_table,
+        personal_choices,
         setting_groups,
         setting_ranges,
         sweep_list,

@@ -9,8 +9,8 @@ The limits were set on the even seeds of fifteen misspecified simulations (300 m
 the odd seeds (298): intervals missed the truth in 1 of 164 (trustworthy), 2 of 70 (doubtful) and
 13 of 64 (none), median errors of the logarithm were 0.11, 0.13 and 0.20, and the area under the
 curve for a missed interval was 0.84. These numbers are of an earlier estimator; the study
-*calibration* has those of the present one. Two checks were dropped because they predicted no miss: the distance of
-the fitted valve from the closed frame, and how much the data narrow the prior.
+*calibration* has those of the present one. Two checks were dropped because they predicted no miss:
+the distance of the fitted valve from the closed frame, and how much the data narrow the prior.
 """
 
 import math
