@@ -129,7 +129,6 @@ def midsurface(
     triangles: IntArray,
     *,
     tips: FloatArray,
-    commissures: FloatArray | None = None,
     anterior: FloatArray | None = None,
     label: Callable[[FloatArray], IntArray] | None = None,
     edge_mm: float = EDGE_MM,
@@ -145,8 +144,6 @@ def midsurface(
     tips
         ``(2, 3)`` mm, papillary tips. The free edge is the loop nearer to them. Each commissure is
         where the leaflets are shortest on the side of a tip.
-    commissures
-        ``(2, 3)`` mm, if known.
     anterior
         ``(3,)`` mm, a point near the anterior annulus, if known. Otherwise the anterior leaflet is
         the taller one.
@@ -169,7 +166,7 @@ def midsurface(
     if label is not None:
         seams = _label_seams(lines, angle, label)
     else:
-        seams = _short_seams(lines, angle, heights, tips, commissures, anterior, derived)
+        seams = _short_seams(lines, angle, heights, tips, anterior, derived)
     rows = max(6, round(float(heights.mean()) / edge_mm) + 1)
     sheet = _sheet(pair, seams, columns, rows)
     for _ in range(ROUNDS):
@@ -292,20 +289,14 @@ def _short_seams(
     angle: FloatArray,
     heights: FloatArray,
     tips: FloatArray,
-    commissures: FloatArray | None,
     anterior: FloatArray | None,
     derived: list[str],
 ) -> FloatArray:
     """As `_label_seams`, but with seams where the leaflets are shortest."""
     annulus = lines[0]
     smooth = gaussian_filter1d(heights, max(1.0, len(angle) / 60), mode="wrap")
-    if commissures is not None:
-        away = np.linalg.norm(annulus[:, None] - np.asarray(commissures), axis=2)
-        chosen = away.argmin(axis=0)
-    else:
-        derived.append("commissures: where the leaflets are shortest on the side of each tip")
-        chosen = _shortest(annulus, smooth, tips)
-    a, b = sorted(chosen.tolist())
+    derived.append("commissures: where the leaflets are shortest on the side of each tip")
+    a, b = sorted(_shortest(annulus, smooth, tips).tolist())
     within = (np.arange(len(angle)) > a) & (np.arange(len(angle)) < b)
     if not 2 < within.sum() < len(angle) - 2:
         raise GeometryError("both commissures are at the same place of the annulus")
