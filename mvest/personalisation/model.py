@@ -154,18 +154,3 @@ def gate_case(
     ]
     at = np.array([means[name] for name in model.names])
     return run_gate(lambda variation: vary(model, variation), at, possible)
-
-
-def gate_lines(report: GateReport) -> list[str]:
-    """A gate's report in lines: the verdict, then the failures."""
-    largest = np.nanmax([row.max_mm for row in report.rows])
-    verdict = "passed" if report.passed else "NOT passed: the closed state is not unique"
-    lines = [
-        f"  gate {verdict}; {len(report.rows) - 1} variations, {largest:.2g} mm at most, and "
-        f"{len(report.paths)} ways along the moduli"
-    ]
-    for row in report.rows:
-        if not row.passed:
-            lines.append(f"  gate: {row.case}: {row.max_mm:.2g} mm off, {row.reason}")
-    lines += [f"  gate: along {path.name}: {path.reason}" for path in report.paths if path.reason]
-    return lines

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from experiments.common.building.closure import mechanics_of, mesh_store
+from experiments.common.building.gate import gate_rows
 from experiments.common.progress import PartBar, SolveBar, say, solving
 from experiments.common.records.record import FIELDS, NOT_GATED, Mesh, Model, Record, has_passed
 from experiments.common.schema import InputFile, Reads, Values, build, contents
@@ -29,7 +30,7 @@ from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation.calibration import CALIBRATIONS
 from mvest.personalisation.chain import personalise
 from mvest.personalisation.design import expect_case
-from mvest.personalisation.model import build_coarse, gate_case, gate_lines, with_pressures
+from mvest.personalisation.model import build_coarse, gate_case, with_pressures
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Expected
 from mvest.personalisation.settings import (
@@ -226,8 +227,10 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
     lines = [*str(case).splitlines(), *(f"derived: {sentence}" for sentence in case.derived)]
     if gate:
         with PartBar(f"{case.name}, gate", 1, "test") as bar:
-            lines += gate_lines(gate_case(case, settings, mesh_store(values)))
+            report = gate_case(case, settings, mesh_store(values))
             bar.step()
+        verdict = "passed" if report.passed else "NOT passed: the closed state is not unique"
+        lines += [f"gate {verdict}", *gate_rows(report).text().splitlines()]
     strange = implausible_values(case)
     lines += [f"{'MISTAKE?' if one.mistake else 'implausible'}: {one}" for one in strange]
     lines.append(

@@ -1,5 +1,6 @@
 """A case from the command line: its settings, its record, and what is refused."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from experiments.common.study import Job
 from experiments.studies.case import STUDY, Settings
 from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import write_case
+from mvest.closure.robustness import GateReport, GateRow
 from mvest.errors import InputError
 from mvest.personalisation import default_settings, design
 from mvest.problem.verdict import ONE_STATE
@@ -116,7 +118,12 @@ def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, mon
         "mvest.personalisation.estimation.estimate",
         lambda *a, **k: pytest.fail("something was estimated"),
     )
-    status, out, err = run(*OWN, f"case={folder}", "check=true")
+    rows = (
+        GateRow("reference", 0.0, 0.0, True, "converged"),
+        GateRow("perturbed start", 0.2, 1.5, False, "converged"),
+    )
+    monkeypatch.setattr("experiments.common.cases.own_case.gate_case", lambda *_: GateReport(rows))
+    status, out, err = run(*OWN, f"case={folder}", "check=true", "gate=true")
     assert status == 0, err
     assert "288 vertices" in out
     assert "leaflets anterior, posterior" in out
@@ -130,6 +137,8 @@ def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, mon
         assert at == pytest.approx([6.23, 2.09, 1.0, 1.0, 1.0])
     (page,) = (tmp_path / "outputs").rglob("check.html")
     for text in (out, page.read_text()):
+        assert "gate NOT passed: the closed state is not unique" in text
+        assert re.search("perturbed start +0.2 +1.5 +no", text)
         assert "E_f anterior" in text
         assert "pressure measured to ±3 mmHg" in text
         assert "all that can be measured, known exactly" in text
