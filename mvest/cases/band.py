@@ -23,7 +23,13 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.surface_coordinates import boundary_loops
-from mvest.valve.geometry.triangles import connected_pieces, directed_edges, surface_edges
+from mvest.valve.geometry.triangles import (
+    arc_length,
+    connected_pieces,
+    directed_edges,
+    loop_length,
+    surface_edges,
+)
 
 ANNULUS_DIAMETER = (15.0, 80.0)
 """mm, largest extent of an annulus, from a small child's to the most dilated adult's."""
@@ -97,10 +103,7 @@ def two_loops(vertices: FloatArray, triangles: IntArray) -> list[IntArray]:
     loops = boundary_loops(triangles)
     if len(loops) == 2:
         return loops
-    perimeter = [
-        float(np.linalg.norm(vertices[loop] - vertices[np.roll(loop, -1)], axis=1).sum())
-        for loop in loops
-    ]
+    perimeter = [loop_length(vertices[loop]) for loop in loops]
     order = np.argsort(perimeter)[::-1]
     listed = "; ".join(
         f"{len(loops[i])} vertices, {perimeter[i]:.1f} mm round, near "
@@ -181,8 +184,7 @@ def arc_shares(loop: FloatArray, begin: int, end: int) -> tuple[IntArray, FloatA
     """Positions in a closed curve from ``begin`` to ``end``, and their share of the arc length."""
     count = (end - begin) % len(loop)
     at = (begin + np.arange(count + 1)) % len(loop)
-    step = np.linalg.norm(np.diff(loop[at], axis=0), axis=1)
-    length = np.concatenate([[0.0], np.cumsum(step)])
+    length = arc_length(loop[at])
     return at, length / length[-1]
 
 

@@ -35,7 +35,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.proximity import closest_points, intersecting_triangles
-from mvest.valve.geometry.triangles import surface_edges
+from mvest.valve.geometry.triangles import arc_length, surface_edges
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import orifice_area
 from mvest.valve.mesh.structured import structured_mesh
@@ -263,8 +263,7 @@ def frames_along(points: FloatArray, count: int) -> IntArray:
 
     The length of the path of ``points (f, k, 3)`` mm is that of their mean displacements.
     """
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=2).mean(axis=1)
-    path = np.concatenate([[0.0], np.cumsum(steps)])
+    path = arc_length(points).mean(axis=1)
     total, last = len(path), 0
     chosen = [0]
     for k in range(1, count - 1):

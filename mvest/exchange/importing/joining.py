@@ -25,9 +25,11 @@ from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.thickening import smooth_vertex_normals
 from mvest.valve.geometry.triangles import (
+    arc_length,
     areas,
     connected_pieces,
     directed_edges,
+    loop_length,
     surface_edges,
 )
 
@@ -162,11 +164,6 @@ def united(segments: Sequence[Leaflet]) -> Leaflet:
         joined_ = Leaflet.of(vertices, np.concatenate([whole.triangles, faces + n, strip]))
         whole = replace(joined_, holes=holes + joined_.holes)
     return whole
-
-
-def loop_length(curve: FloatArray) -> float:
-    """Length (mm) of a closed curve ``(k, 3)``."""
-    return float(np.linalg.norm(curve - np.roll(curve, -1, axis=0), axis=1).sum())
 
 
 def commissures_on(contour: FloatArray, leaflets: Sequence[Leaflet]) -> FloatArray:
@@ -325,13 +322,13 @@ def _cornered(leaflet: Leaflet, rough: IntArray, other: Leaflet) -> tuple[IntArr
     middle = len(rough) // 2
     loop = np.roll(leaflet.loop, -int(np.flatnonzero(leaflet.loop == rough[middle])[0]))
     reach = min(MAX_MISS, 0.2 * loop_length(leaflet.curve))
-    rough_way = _along(leaflet.vertices[rough])
+    rough_way = arc_length(leaflet.vertices[rough])
     ends = []
     for way, expected in (
         (loop, rough_way[-1] - rough_way[middle]),
         (np.r_[loop[0], loop[:0:-1]], rough_way[middle]),
     ):
-        along = _along(leaflet.vertices[way])
+        along = arc_length(leaflet.vertices[way])
         off = np.linalg.norm(closest_on_loop(leaflet.vertices[way], other.curve)[2], axis=1)
         distance = np.where(np.abs(along - expected) <= reach, off, np.inf)
         first = int(np.argmax(distance <= max(SEAM_MM, float(distance.min()))))
@@ -344,13 +341,9 @@ def _cornered(leaflet: Leaflet, rough: IntArray, other: Leaflet) -> tuple[IntArr
     return np.r_[loop[begin:], loop[: last + 1]], loop[last : begin + 1]
 
 
-def _along(curve: FloatArray) -> FloatArray:
-    """Arc length (mm) of a curve ``(k, 3)`` up to each point."""
-    return np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
-
-
 def _shares(curve: FloatArray) -> FloatArray:
-    return _along(curve) / _along(curve)[-1]
+    length = arc_length(curve)
+    return length / length[-1]
 
 
 def _seam(a: FloatArray, b: FloatArray, given: tuple[float, float] | None) -> tuple[int, int]:
@@ -431,8 +424,7 @@ def _curled(rows: FloatArray, radius: FloatArray) -> FloatArray:
     The side of a thick leaflet includes half of its rim: a quarter circle with a ``radius (2, k)``
     of half the thickness.
     """
-    step = np.linalg.norm(np.diff(rows, axis=0), axis=2)
-    along = np.vstack([np.zeros(rows.shape[1]), np.cumsum(step, axis=0)])
+    along = arc_length(rows)
     part = np.linspace(0.0, 1.0, len(rows))
     ends = []
     for turned, own in zip((False, True), radius, strict=True):

@@ -28,7 +28,7 @@ from mvest.valve.geometry.surface_coordinates import (
     surface_coordinates,
     wrapped,
 )
-from mvest.valve.geometry.triangles import area_vectors
+from mvest.valve.geometry.triangles import arc_length, area_vectors, loop_length
 from mvest.valve.geometry.walls import Wall, closed_band, walls
 
 EDGE_MM = 1.2
@@ -74,7 +74,7 @@ class Midsurface:
     def heights(self) -> FloatArray:
         """Largest length ``(2,)`` mm of each leaflet, from annulus to free edge."""
         grid = self.vertices.reshape(-1, len(self.annulus), 3)
-        return np.asarray(_arc_lengths(grid)[-1].reshape(2, -1).max(axis=1))
+        return np.asarray(arc_length(grid)[-1].reshape(2, -1).max(axis=1))
 
     def exchanged(self) -> Midsurface:
         """The same surface with anterior and posterior leaflets swapped."""
@@ -158,11 +158,11 @@ def midsurface(
     away = [cdist(first.vertices[loop], tips).min(axis=1).mean() for loop in first.loops]
     annulus = int(np.argmax(away))
     pair = _PairedWalls(first, second, annulus)
-    perimeter = np.mean([_length(first.vertices[loop]) for loop in first.loops])
+    perimeter = np.mean([loop_length(first.vertices[loop]) for loop in first.loops])
     columns = max(24, 2 * round(perimeter / edge_mm / 2))
     angle = 2 * np.pi * np.arange(ANGLES * columns) / (ANGLES * columns)
     lines = pair.middle(angle, np.linspace(0, 1, LEVELS)[:, None])
-    heights = _arc_lengths(lines)[-1]
+    heights = arc_length(lines)[-1]
     if label is not None:
         seams = _label_seams(lines, angle, label)
     else:
@@ -187,10 +187,6 @@ def midsurface(
         np.arange(columns) + (rows - 1) * columns,
         tuple(derived),
     )
-
-
-def _length(loop: FloatArray) -> float:
-    return float(np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum())
 
 
 class _PairedWalls:
@@ -336,22 +332,16 @@ def _sheet(pair: _PairedWalls, seams: FloatArray, columns: int, rows: int) -> Fl
         shares = []
         for end in (0, -1):
             curve = pair.middle(low[end] + share * (high - low)[end], s[end])
-            arc = _arc_lengths(curve[:, None])[:, 0]
+            arc = arc_length(curve)
             equal = np.arange(columns // 2) / (columns // 2)
             shares.append(np.interp(equal, arc / arc[-1], share))
         angles.append(low + ((1 - s) * shares[0] + s * shares[1]) * (high - low))
     return _spread(pair.middle(np.concatenate(angles, axis=1), s), rows)
 
 
-def _arc_lengths(lines: FloatArray) -> FloatArray:
-    """Arc lengths ``(k, c)`` mm along columns ``(k, c, 3)``."""
-    steps = np.linalg.norm(np.diff(lines, axis=0), axis=2)
-    return np.concatenate([np.zeros((1, lines.shape[1])), np.cumsum(steps, axis=0)])
-
-
 def _spread(lines: FloatArray, rows: int) -> FloatArray:
     """Columns ``(k, c, 3)`` resampled at equal arc lengths to ``(rows, c, 3)``."""
-    arc = _arc_lengths(lines)
+    arc = arc_length(lines)
     share = np.linspace(0, 1, rows)
     result = np.empty((rows, lines.shape[1], 3))
     for column in range(lines.shape[1]):
@@ -402,7 +392,7 @@ def _thickness(sheet: FloatArray, first: Wall, second: Wall) -> FloatArray:
         closest_points(points, wall.vertices, wall.triangles).distance for wall in (first, second)
     )
     thickness = np.asarray(total).reshape(shape)
-    arc = _arc_lengths(sheet)
+    arc = arc_length(sheet)
     near = np.minimum(arc, arc[-1] - arc)
     row = np.arange(shape[0])
     for column in range(shape[1]):

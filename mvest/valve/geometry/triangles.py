@@ -39,6 +39,17 @@ def area_vectors_change(vertices: FloatArray, triangles: IntArray, moves: FloatA
     return np.asarray(0.5 * change)
 
 
+def arc_length(points: FloatArray) -> FloatArray:
+    """Arc length ``(k, ...)`` mm of curves ``(k, ..., 3)`` from their first point to each point."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
+
+
+def loop_length(curve: FloatArray) -> float:
+    """Length (mm) of a closed curve ``(k, 3)``."""
+    return float(np.linalg.norm(curve - np.roll(curve, -1, axis=0), axis=1).sum())
+
+
 def directed_edges(triangles: IntArray) -> IntArray:
     """Directed edges ``(3 m, 2)``: first all from corner 0, then all from 1, then all from 2."""
     return np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])

@@ -24,7 +24,7 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates, wrapped
-from mvest.valve.geometry.triangles import edge_table, surface_edges, unit_rows
+from mvest.valve.geometry.triangles import arc_length, edge_table, surface_edges, unit_rows
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 LEVELS_PER_LAYER = {"wedge12": 1, "wedge18": 2}
@@ -64,10 +64,7 @@ def remesh(
             "the surface given"
         )
     coordinates = surface_coordinates(x, surface.triangles, annulus, free_edge)
-    arcs = [
-        np.cumsum(np.append(0, np.linalg.norm(x[np.roll(loop, -1)] - x[loop], axis=1)))
-        for loop in (annulus, free_edge)
-    ]
+    arcs = [arc_length(x[np.append(loop, loop[0])]) for loop in (annulus, free_edge)]
     # Edge length h with n = A / (sqrt(3)/2 h^2) + L / (2 h): vertices on edges own half cells.
     a, b = 2 * surface.areas.sum() / np.sqrt(3), sum(arc[-1] for arc in arcs) / 2
     h = (b + np.sqrt(b * b + 4 * a * vertices)) / (2 * vertices)
