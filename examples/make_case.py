@@ -14,7 +14,7 @@ import numpy as np
 
 import mvest
 from mvest.cases.tissue import write_chordae
-from mvest.exchange.surfaces import write_surface
+from mvest.exchange.surfaces import Surface, write_surface
 from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation
 
 TRUTH = np.array([1.2 * 6.23, 0.8 * 2.09])
@@ -56,8 +56,8 @@ def make_case(folder):
     folder.mkdir(parents=True, exist_ok=True)
     surface = valve.surface
     for name, x in zip(("open", "closed"), frames, strict=True):
-        label = {"region": surface.region}
-        write_surface(folder / f"{name}.vtp", x, surface.triangles, None, label)
+        labelled = Surface(x, surface.triangles, cell_data={"region": surface.region})
+        write_surface(folder / f"{name}.vtp", labelled)
     write_chordae(folder / "chordae.csv", valve.chordae)
     tips, families = valve.papillary_tips.round(3).tolist(), ", ".join(valve.chordae.family_names)
     text = TEXT.format(tips=tips, families=families)

@@ -27,7 +27,7 @@ from mvest.cases.frames import LOOPS, SeenFrame, place_frame, read_frame, refere
 from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, PointData
 from mvest.cases.tissue import point_data, read_chordae, read_leaflets, write_chordae
 from mvest.errors import InputError
-from mvest.exchange.surfaces import write_surface
+from mvest.exchange.surfaces import Surface, write_surface
 from mvest.files import write_atomically
 from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line, write_columns
@@ -211,7 +211,8 @@ def _write_frame(folder: Path, case: ValveCase, number: int, frame: Frame) -> di
         if isinstance(case.uncertainty.std_mm, np.ndarray):
             point_data["std_mm"] = case.uncertainty.std_mm
     cell_data = {"region": np.asarray(frame.region)}
-    write_surface(folder / f"{stem}.vtp", frame.vertices, frame.triangles, point_data, cell_data)
+    surface = Surface(frame.vertices, frame.triangles, point_data, cell_data)
+    write_surface(folder / f"{stem}.vtp", surface)
     for name in LOOPS:
         file = folder / f"{stem}_{name}.csv"
         if frame.role is Role.REFERENCE:

@@ -234,42 +234,33 @@ def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
         raise InputError(f"{path}: extension {path.suffix!r}, expected {', '.join(suffixes)}")
 
 
-def write_surface(
-    path: Path | str,
-    vertices: FloatArray,
-    triangles: IntArray,
-    point_data: Data | None = None,
-    cell_data: Data | None = None,
-    space: str = "",
-) -> Path:
-    """Write a triangulated surface as a ``.vtp`` file.
-
-    ``space`` ("LPS") names the axes for 3D Slicer.
+def write_surface(path: Path | str, surface: Surface) -> Path:
+    """Write points, triangles, their data, and the name of the axes as a ``.vtp`` file.
 
     InputError or GeometryError if the suffix differs, a point is not finite, or the file cannot be
     written.
     """
     target = Path(path)
     _check_suffix(target, (".vtp",))
-    points = np.ascontiguousarray(vertices, dtype=np.float64)
-    faces = np.ascontiguousarray(triangles, dtype=np.int64)
+    points = np.ascontiguousarray(surface.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(surface.triangles, dtype=np.int64)
     if not np.isfinite(points).all():
         raise GeometryError(f"{target}: points that are not finite numbers")
     data = [
         {name: np.ascontiguousarray(v, np.int8 if v.dtype == bool else None) for name, v in given}
-        for given in ((point_data or {}).items(), (cell_data or {}).items())
+        for given in (surface.point_data.items(), surface.cell_data.items())
     ]
-    surface = polydata(points, faces.ravel(), np.full(len(faces), 3), *data)
-    if space:
+    written = polydata(points, faces.ravel(), np.full(len(faces), 3), *data)
+    if surface.space:
         words = vtk_module("vtkCommonCore").vtkStringArray()
         words.SetName("SPACE")
-        words.InsertNextValue(space)
-        surface.GetFieldData().AddArray(words)
+        words.InsertNextValue(surface.space)
+        written.GetFieldData().AddArray(words)
 
     def write(file: Path) -> None:
         writer = vtk_module("vtkIOXML").vtkXMLPolyDataWriter()
         writer.SetFileName(str(file))
-        writer.SetInputData(surface)
+        writer.SetInputData(written)
         writer.SetDataModeToBinary()
         if not writer.Write():
             raise OSError(f"VTK's error {writer.GetErrorCode()}")
@@ -300,7 +291,6 @@ def write_surface_series(
     collection = ET.SubElement(root, "Collection")
     for number, (time, state) in enumerate(zip(map(float, times), states, strict=True)):
         file = index.with_name(f"{index.stem}_{number:04d}.vtp")
-        data = (state.point_data, state.cell_data)
-        write_surface(file, state.vertices, state.triangles, *data, space="LPS")
+        write_surface(file, replace(state, space="LPS"))
         ET.SubElement(collection, "DataSet", timestep=repr(time), file=file.name)
     return write_atomically(index, ET.tostring(root, encoding="utf-8", xml_declaration=True))

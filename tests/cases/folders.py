@@ -8,7 +8,7 @@ import yaml
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.cases.tissue import LeafletBand
-from mvest.exchange.surfaces import write_surface
+from mvest.exchange.surfaces import Surface, write_surface
 from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
 from mvest.valve.anatomy.template import Template
 
@@ -138,7 +138,7 @@ def save_frames(folder: Path, triangles=None, columns=24, rows=8, names=("open",
 
 def save_surface(file, vertices, triangles, region):
     data = {} if region is None else {"region": region}
-    write_surface(file, vertices, triangles, None, data)
+    write_surface(file, Surface(vertices, triangles, cell_data=data))
 
 
 def save(folder: Path, document):

@@ -86,9 +86,9 @@ def case_of_frames(
     with tempfile.TemporaryDirectory() as temporary:
         folder, entries = Path(temporary), []
         for number, one in enumerate(frames):
-            shape = one.surface.vertices, one.surface.triangles
             labels = {"region": np.asarray(one.surface.region)}
-            write_surface(folder / f"{number}.vtp", *shape, one.point_data, labels)
+            surface = Surface(one.surface.vertices, one.surface.triangles, one.point_data, labels)
+            write_surface(folder / f"{number}.vtp", surface)
             entry = {"name": one.name, "role": one.role.value, "time": float(one.time)}
             entry |= {"surface": f"{number}.vtp", "papillary_tips": one.tips.tolist()}
             apart = {} if one.role is Role.REFERENCE else {"corresponds": False}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.exchange.surfaces import read_surface, write_surface
+from mvest.exchange.surfaces import Surface, read_surface, write_surface
 from tests.valve.conftest import shapes
 
 __all__ = ["shapes"]
@@ -19,7 +19,9 @@ def test_a_surface_comes_back_exactly(shapes, tmp_path):
         "unknown": np.r_[np.nan, np.inf, np.zeros(len(vertices) - 2)],
     }
     cells = {"label": rng.integers(-5, 5, len(triangles)), "flag": rng.random(len(triangles)) > 0.5}
-    back = read_surface(write_surface(tmp_path / "s.vtp", vertices, triangles, points, cells))
+    written = Surface(vertices, triangles, points, cells, space="LPS")
+    back = read_surface(write_surface(tmp_path / "s.vtp", written))
+    assert back.space == "LPS"
     np.testing.assert_array_equal(back.vertices, vertices)
     np.testing.assert_array_equal(back.triangles, triangles)
     assert [p.name for p in tmp_path.iterdir()] == ["s.vtp"]
@@ -42,5 +44,5 @@ def test_bad_output_is_one_clear_error_and_leaves_nothing(shapes, tmp_path, name
     vertices, triangles = shapes.box()
     box = {"vertices": vertices, "triangles": triangles}
     with pytest.raises(InputError, match=message):
-        write_surface(tmp_path / name, **box | change)
+        write_surface(tmp_path / name, Surface(**box | change))
     assert list(tmp_path.iterdir()) == []

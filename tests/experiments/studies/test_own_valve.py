@@ -12,7 +12,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from mvest.closure.model import ClosureModel
-from mvest.exchange.surfaces import write_surface
+from mvest.exchange.surfaces import Surface, write_surface
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
@@ -71,7 +71,8 @@ def write(folder, seen, place):
     frames = []
     for k, (name, x) in enumerate((("open", valve.surface.vertices), ("closed", closed))):
         surface, region = f"{name}.vtp", {"region": valve.surface.region}
-        write_surface(folder / surface, place(x), valve.surface.triangles, None, region)
+        seen_surface = Surface(place(x), valve.surface.triangles, cell_data=region)
+        write_surface(folder / surface, seen_surface)
         tips = place(valve.motion.papillary_tips[-k]).tolist()
         about = {"name": name, "time": 0.4 * k, "role": ("reference", "closed")[k]}
         about |= {"surface": surface, "papillary_tips": tips, "pressure": PRESSURE * k}
