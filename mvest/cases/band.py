@@ -390,5 +390,5 @@ def check_closing_pressure(pressure_mmhg: float, unit: str) -> None:
         other = "kPa" if unit == "mmHg" else "mmHg"
         raise InputError(
             f"{pressure_mmhg:g} mmHg on the closed valve, expected {low:g} to {high:g} mmHg: is it "
-            f"in {other} (units.pressure says {unit})? A positive pressure closes the valve"
+            f"in {other} (the unit given is {unit})? A positive pressure closes the valve"
         )

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from mvest.cases.band import (
-    CLOSING_PRESSURE,
     check_annulus_size,
     check_band,
+    check_closing_pressure,
     check_normals,
     check_thickness,
     check_tips,
@@ -44,12 +44,7 @@ class CaseFrames:
     def __post_init__(self) -> None:
         if self.open == self.closed:
             raise InputError(f"frame {self.open} is both the open and the closed one")
-        low, high = CLOSING_PRESSURE
-        if not low <= self.pressure_mmHg <= high:
-            raise InputError(
-                f"pressure of frame {self.closed} = {self.pressure_mmHg} mmHg on the closed valve, "
-                f"expected {low:g} to {high:g} mmHg"
-            )
+        check_closing_pressure(self.pressure_mmHg, "mmHg")
 
     @property
     def in_order(self) -> list[int]:

@@ -173,7 +173,7 @@ def test_a_surface_that_is_no_valve_is_refused_with_its_frame():
 def test_frames_pressures_and_thicknesses_out_of_place_are_refused():
     with pytest.raises(InputError, match="both the open and the closed"):
         CaseFrames(1, 1, 100.0)
-    with pytest.raises(InputError, match=r"pressure of frame 2 = 16.0 mmHg"):
+    with pytest.raises(InputError, match=r"16 mmHg on the closed valve.*is it in kPa"):
         CaseFrames(0, 2, 16.0)
     with pytest.raises(InputError, match="thickness of anterior, expected of anterior, posterior"):
         case_of_sequence(sequence(), FRAMES, TEXTS, thickness_mm={"anterior": 1.3})
