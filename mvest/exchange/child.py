@@ -130,12 +130,9 @@ def _read(stream: Any) -> Any:
 
     def exactly(size: int) -> np.ndarray:
         content = np.empty(size, dtype=np.uint8)
-        done = 0
-        while done < size:
-            count = stream.readinto(content[done:].data)
-            if not count:
-                raise EOFError
-            done += count
+        # A buffered stream fills the array unless it ended.
+        if stream.readinto(content.data) < size:
+            raise EOFError
         return content
 
     def whole(value: dict[str, Any]) -> Any:
