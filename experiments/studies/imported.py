@@ -312,7 +312,7 @@ def import_heart(heart: HeartSettings) -> ValveCase:
         case,
         name=heart.name,
         source=heart.citation,
-        chordae=lay_out_chordae(band, tips, closed, tips, ChordLayout()),
+        chordae=lay_out_chordae(band.position, tips, closed.position, tips, ChordLayout()),
         derived=tuple(line.replace(*stated) for line in case.derived),
     )
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -59,6 +59,9 @@ valve to valve 0.006, marginal) and 1.005 (0.027, 0.009, basal 1.011 and strut 0
 SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=0.997, basal_slack=0.993)
 """The same for chordae placed by a `LeafletBand`, which shifts them by up to 2.1 mm: 0.997 (SD from
 way to way 0.024, marginal) and 0.993 (0.041, basal 1.012 and strut 0.935) in these valves."""
+
+Positions: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
+"""Positions ``(k, 3)`` mm of points at phi (degrees) and s, such as `LeafletBand.position`."""
 
 
 def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface:
@@ -251,7 +254,6 @@ def _laid_out(
 
     opened = _band_of(reference, names)
     closed, band = next((p for p in placed if p[0].role is Role.CLOSED), placed[0])
-    goal: LeafletBand | FloatArray
     layout = SEEN_ON_BAND
     if closed.role is not Role.CLOSED:
         layout = ChordLayout()
@@ -261,23 +263,19 @@ def _laid_out(
         )
         goal = assumed_closure(opened, closed.annulus, closed.papillary_tips)
     elif closed.corresponds:
-        how, goal = "the closed frame (through its vertices)", closed.vertices
+        how = "the closed frame (through its vertices)"
+        goal = replace(opened, vertices=closed.vertices)
     else:
         how = "the closed frame (through the same material coordinates in it)"
         goal = _band_of(band, names)
-    chordae = lay_out_chordae(opened, seen.tips, goal, closed.papillary_tips, layout)
+    chordae = lay_out_chordae(
+        opened.position, seen.tips, goal.position, closed.papillary_tips, layout
+    )
     folder.derived.append(
         f"chordae: {len(chordae.insertion)} leaflet ends laid out as in the template, those of a "
         f"half to its nearer papillary tip, rest lengths from {how}"
     )
     return chordae
-
-
-class Places(NamedTuple):
-    """Vertices ``(n, 3)`` mm of a valve, and its function like `LeafletBand.locate`."""
-
-    vertices: FloatArray
-    locate: Callable[[FloatArray, FloatArray], tuple[IntArray, FloatArray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,7 +347,7 @@ class LeafletBand:
 
     def position(self, phi: FloatArray, s: FloatArray) -> FloatArray:
         """Positions ``(k, 3)`` mm of points at phi (degrees) and s."""
-        return _weighted(self.vertices, *self.locate(phi, s))
+        return weighted(self.vertices, *self.locate(phi, s))
 
 
 def _angle_table(
@@ -372,7 +370,8 @@ def _angle_table(
     return np.stack([phi, np.unwrap(angle)])
 
 
-def _weighted(vertices: FloatArray, corners: IntArray, weights: FloatArray) -> FloatArray:
+def weighted(vertices: FloatArray, corners: IntArray, weights: FloatArray) -> FloatArray:
+    """Points ``(k, 3)`` in triangles with these corners and weights ``(k, 3)``."""
     result: FloatArray = np.einsum("ka,kai->ki", weights, vertices[corners])
     return result
 
@@ -382,8 +381,8 @@ def assumed_closure(
     annulus: FloatArray,
     tips: FloatArray,
     closed_depth: float = CLOSED_DEPTH,
-) -> FloatArray:
-    """Assumed positions ``(n, 3)`` mm of the vertices in the closed valve, from its open shape.
+) -> LeafletBand:
+    """The band with assumed positions of its vertices in the closed valve, from its open shape.
 
     The free edges of the two leaflets meet half-way, at points of equal share between the
     commissures, at ``closed_depth`` of their depth below the annulus. Leaflets follow in proportion
@@ -400,33 +399,28 @@ def assumed_closure(
     move = goal - (1 - closed_depth) * depth[:, None] * down - here
     coordinates = open_valve.coordinates
     along = [np.interp(coordinates.theta, theta, each, period=2 * np.pi) for each in move.T]
-    return np.asarray(open_valve.vertices + coordinates.s[:, None] * np.stack(along, axis=1))
+    moved = coordinates.s[:, None] * np.stack(along, axis=1)
+    return replace(open_valve, vertices=open_valve.vertices + moved)
 
 
 def lay_out_chordae(
-    open_valve: Places | LeafletBand,
+    open_valve: Positions,
     open_tips: FloatArray,
-    closed_valve: LeafletBand | FloatArray,
+    closed_valve: Positions,
     closed_tips: FloatArray,
     layout: ChordLayout,
 ) -> Chordae:
     """Place the chordae of a layout on a valve with two papillary tips ``(2, 3)`` mm.
 
     All chordae of a half start at one tip: the one to which their sum of distances in the reference
-    frame is least. Rest lengths are those of `laid_out`. The closed frame has positions ``(n, 3)``
-    mm of the reference's vertices, or its own coordinates if its vertices do not correspond. The
-    layout is the template's for an intended closed frame (`assumed_closure`); for an observed one
-    `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are bands. InputError if there are not two tips.
+    frame is least. Rest lengths are those of `laid_out`. The layout is the template's for an
+    intended closed frame (`assumed_closure`); for an observed one `SEEN_CLOSURE`, or `SEEN_ON_BAND`
+    if the valves are bands. InputError if there are not two tips.
     """
     if len(open_tips) != 2 or len(closed_tips) != 2:
         raise InputError(f"{len(open_tips)} papillary tips; the layout of chordae needs two")
     places = Template(TemplateParameters(chordae=layout)).chord_places()
-    corners, weights = open_valve.locate(places.phi, places.s)
-    insertion = _weighted(open_valve.vertices, corners, weights)
-    if isinstance(closed_valve, np.ndarray):
-        closed = _weighted(closed_valve, corners, weights)
-    else:
-        closed = closed_valve.position(places.phi, places.s)
+    insertion, closed = (at(places.phi, places.s) for at in (open_valve, closed_valve))
     own = places.tip[: len(insertion)]
     reach = [np.linalg.norm(insertion - open_tips[end], axis=1).sum() for end in (own, 1 - own)]
     tip = places.tip if reach[0] <= reach[1] else 1 - places.tip

@@ -40,6 +40,11 @@ def at_angle(degrees, s, radius=RADIUS):
     return [radius * np.cos(angle), radius * np.sin(angle), -HEIGHT * s]
 
 
+def narrowed(band):
+    """Positions in a band of half the radius."""
+    return replace(band, vertices=band.vertices * [0.5, 0.5, 1.0]).position
+
+
 @pytest.mark.parametrize("roll", [0, 11])
 @pytest.mark.parametrize("backwards", [False, True])
 def test_phi_is_stretched_between_the_commissures(roll, backwards):
@@ -71,8 +76,8 @@ def test_rest_lengths_follow_the_closed_frame_but_never_fall_below_the_open_one(
         marginal_slack=0.9, basal_slack=2.0,
     )  # fmt: skip
     tips = np.array([[20.0, 0.0, -30.0], [-20.0, 0.0, -30.0]])
-    closed, lower = band.vertices * [0.5, 0.5, 1.0], np.array([0.0, 0.0, 5.0])
-    chordae = lay_out_chordae(band, tips, closed, tips - lower, layout)
+    closed, lower = narrowed(band), np.array([0.0, 0.0, 5.0])
+    chordae = lay_out_chordae(band.position, tips, closed, tips - lower, layout)
     # phi = 180 - 3/14 180 from the side of 160 degrees: angles 130 and 50, and -90 twice.
     at = MARGINAL_S
     places = np.array([at_angle(130, at), at_angle(-90, 0.5), at_angle(50, at), at_angle(-90, 0.5)])
@@ -95,8 +100,8 @@ def test_fans_branch_on_the_way_from_the_tip_to_their_middle():
         strut=(), open_slack=1.1, marginal_slack=0.9, basal_slack=2.0, stiffness=(40.0, 16.0, 1.0),
     )  # fmt: skip
     tips = np.array([[20.0, 0.0, -30.0], [-20.0, 0.0, -30.0]])
-    closed, lower = band.vertices * [0.5, 0.5, 1.0], np.array([0.0, 0.0, 5.0])
-    chordae = lay_out_chordae(band, tips, closed, tips - lower, layout)
+    closed, lower = narrowed(band), np.array([0.0, 0.0, 5.0])
+    chordae = lay_out_chordae(band.position, tips, closed, tips - lower, layout)
     # phi = 2/14 and 4/14 of 180 between 160 and 20 degrees: angles 140, 120 and -90; mirrored.
     angles, depth = (140, 120, -90, 40, 60, -90), (MARGINAL_S, MARGINAL_S, 0.5) * 2
     places = np.array([at_angle(*place) for place in zip(angles, depth, strict=True)])
@@ -120,7 +125,7 @@ def test_fans_branch_on_the_way_from_the_tip_to_their_middle():
     assert chordae.axial_stiffness.tolist() == [20, 20, 16, 20, 20, 16, 40, 40]
     # Branches of a fan across the middle start at the tip that is nearer to its middle.
     across = replace(layout, marginal=(84.0,), fan_width=24.0)
-    tip = lay_out_chordae(band, tips, closed, tips - lower, across).tip
+    tip = lay_out_chordae(band.position, tips, closed, tips - lower, across).tip
     assert tip[[0, 1, 6]].tolist() == [1, 1, 1]
     assert tip[[3, 4, 7]].tolist() == [0, 0, 0]
 
@@ -129,9 +134,8 @@ def test_chordae_of_a_half_start_at_one_tip_also_where_the_other_is_nearer():
     valve = Template().valve(40, 12)
     for tips in (valve.papillary_tips, valve.papillary_tips[::-1]):
         shifted = tips + np.array([3.0, 0.0, 0.0])
-        chordae = lay_out_chordae(
-            band_of(valve), shifted, valve.surface.vertices, shifted, SEEN_ON_BAND
-        )
+        at = band_of(valve).position
+        chordae = lay_out_chordae(at, shifted, at, shifted, SEEN_ON_BAND)
         own = chordae.end_tip
         np.testing.assert_array_equal(np.sign(chordae.insertion[:, 0]), np.sign(tips[own, 0]))
         reach = np.linalg.norm(chordae.insertion[:, None] - shifted, axis=2)
@@ -157,13 +161,12 @@ def test_an_open_frame_alone_comes_back_as_it_was_written(tmp_path, anatomy):
 def test_an_assumed_closure_brings_the_edges_together(anatomy):
     band = band_of(anatomy)
     frame = anatomy.frames[0]
-    closed = assumed_closure(band, frame.annulus, frame.papillary_tips)
-    np.testing.assert_allclose(closed[anatomy.annulus], frame.annulus, atol=1e-9)
+    moved = assumed_closure(band, frame.annulus, frame.papillary_tips)
+    np.testing.assert_allclose(moved.vertices[anatomy.annulus], frame.annulus, atol=1e-9)
     phi = np.linspace(10.0, 170.0, 9)
-    moved = replace(band, vertices=closed)
     gap = moved.position(phi, np.ones(9)) - moved.position(360.0 - phi, np.ones(9))
     before = band.position(phi, np.ones(9)) - band.position(360.0 - phi, np.ones(9))
     assert np.linalg.norm(gap, axis=1).max() < 0.5 < 5.0 < np.linalg.norm(before, axis=1).max()
     middle = frame.annulus[:, 2].mean()
-    depth = closed[anatomy.free_edge, 2].mean() - middle
+    depth = moved.vertices[anatomy.free_edge, 2].mean() - middle
     assert depth == pytest.approx(CLOSED_DEPTH * (frame.free_edge[:, 2].mean() - middle), rel=0.02)

@@ -128,9 +128,9 @@ def laid_out(case, tips=0.0, open_move=0.0, closed_move=0.0):
         surface.region_names.index("anterior"),
     )
     return lay_out_chordae(
-        band,
+        band.position,
         np.asarray(case.frame(Role.REFERENCE).papillary_tips) + tips,
-        closed.vertices + closed_move,
+        replace(band, vertices=closed.vertices + closed_move).position,
         closed.papillary_tips + tips,
         SEEN_ON_BAND,
     )

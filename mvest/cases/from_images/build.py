@@ -17,7 +17,7 @@ from mvest.cases.band import (
 )
 from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
 from mvest.cases.from_images.measures import Row, closed_frame
-from mvest.cases.tissue import GENERIC_THICKNESS, SEEN_CLOSURE, Places, lay_out_chordae
+from mvest.cases.tissue import GENERIC_THICKNESS, SEEN_CLOSURE, lay_out_chordae, weighted
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
@@ -137,9 +137,9 @@ def case_of_sequence(
     shape = reference, layout.triangles, layout.region, layout.region_names
     surface = LeafletSurface(*shape, _fibres(layout, reference, typical), thickness)
     chordae = lay_out_chordae(
-        Places(reference, layout.locate),
+        lambda phi, s: weighted(reference, *layout.locate(phi, s)),
         sequence.tips[frames.open],
-        sequence.vertices[frames.closed],
+        lambda phi, s: weighted(sequence.vertices[frames.closed], *layout.locate(phi, s)),
         sequence.tips[frames.closed],
         SEEN_CLOSURE,
     )
