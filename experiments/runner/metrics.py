@@ -6,9 +6,8 @@ from typing import Any
 
 from experiments.common.config import is_hashed
 from experiments.common.records.record import Record
+from experiments.common.schema import Values
 from experiments.sweeps.collected import short_names
-
-Values = Mapping[str, Any]
 
 ALWAYS = (
     "study", "valve.folder_sha256", "mesh.source", "mechanics.element", "filter.mode",

@@ -28,9 +28,9 @@ from omegaconf import OmegaConf
 
 from experiments.common.progress import PartBar, say
 from experiments.common.records.record import read_record
-from experiments.common.schema import validated
+from experiments.common.schema import Values, validated
 from experiments.runner.jobs import CONFIG, RESULT, is_done
-from experiments.runner.metrics import Values, implausible, metrics, settings_of
+from experiments.runner.metrics import implausible, metrics, settings_of
 from experiments.runner.plan import PLAN
 from experiments.sweeps.collected import read_sweep
 from mvest.errors import ConfigurationError, InputError, MvestError

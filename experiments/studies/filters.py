@@ -189,7 +189,7 @@ def build_problem(config: Values, name: str, about: FilterProblem) -> Problem:
             "guided": False,
         }
     )
-    seen = np.zeros((1, len(twin.valve.surface.vertices)), dtype=np.bool_)
+    seen = np.zeros((1, len(twin.model.valve.surface.vertices)), dtype=np.bool_)
     seen[:, :: about.every] = True
     model = observed_frames(twin.model, ("closed",), seen)
     return Problem(name, about, twin.model, model, prior)

@@ -100,7 +100,7 @@ def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
     assert isinstance(result.observation, Observation)
     assert result.fitted is not None
     return {
-        **valve_fields(twin.valve, result.observation.frames[-1:]),
+        **valve_fields(twin.model.valve, result.observation.frames[-1:]),
         "observed": result.observation.positions[-1:].astype(np.float32),
         "fitted": result.fitted[-1:].astype(np.float32),
         "distance_fitted": np.asarray(result.distance, dtype=np.float64)[None],

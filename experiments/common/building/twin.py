@@ -41,7 +41,7 @@ from mvest.problem.stored import Extrapolated, StoredModel, key_of
 from mvest.problem.synthetic import TwinData, simulate_observation
 from mvest.reporting.expectation import expectation_text, unknown_text
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.valve import LeafletSurface, Valve
+from mvest.valve.anatomy.valve import LeafletSurface
 
 
 def build_truth(
@@ -142,7 +142,6 @@ class Twin:
     truth_model: ClosureModel  # a separate one, which makes the observation
     source: StoredModel | Extrapolated  # ``truth_model`` with its cache, extrapolated if requested
     truth_values: FloatArray  # (p,)
-    valve: Valve  # the observed surface
     # (model, values= (p,), rng=) -> an observation of what the model predicts there
     observe: Callable[..., TwinData]
 
@@ -192,7 +191,6 @@ def build_twin(config: Values) -> Twin:
         truth_model=truth_model,
         source=source,
         truth_values=values,
-        valve=valve,
         observe=partial(
             simulate_observation,
             parameters=parameters,
