@@ -149,20 +149,15 @@ def solving(title: str, model: ClosureModel, names: Sequence[str] = ()) -> Itera
 class PartBar:
     """A bar over the equal pieces of one part of a study, and a line when the part is done.
 
-    ``total`` is the number of pieces, 0 if it is known only after the first one; ``workers`` pieces
-    are in work at a time. ``quiet`` writes no line at the end.
+    ``total`` is the number of pieces, 0 if it is known only after the first one. ``quiet`` writes
+    no line at the end. The time left follows from the mean rate since the beginning.
     """
 
-    def __init__(
-        self, title: str, total: int, unit: str, workers: int = 1, *, quiet: bool = False
-    ) -> None:
-        self._title, self._total, self._unit, self._workers = title, total, unit, workers
-        self._quiet, self._done, self._spent = quiet, 0, 0.0
-        # tqdm's own estimate of the time left knows no workers.
-        form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
-        bar = {"total": total, "desc": title, "disable": None, "bar_format": form}
+    def __init__(self, title: str, total: int, unit: str, *, quiet: bool = False) -> None:
+        self._title, self._total, self._unit = title, total, unit
+        self._quiet, self._done = quiet, 0
+        bar = {"total": total, "desc": title, "unit": unit, "disable": None, "smoothing": 0.0}
         self._lines = Heartbeat(self._status, **bar)
-        self._last = self._lines.began
 
     def __enter__(self) -> PartBar:
         return self
@@ -172,27 +167,15 @@ class PartBar:
         if kind is None and not self._quiet:
             say(f"{self._title}: done in {duration(self._lines.elapsed)}")
 
-    def step(self, total: int | None = None, seconds: float | None = None) -> None:
-        """One more piece is done, of ``total`` if given; it took ``seconds``, if given."""
-        now = time.monotonic()
-        self._spent += now - self._last if seconds is None else seconds
-        self._last = now
+    def step(self, total: int | None = None) -> None:
+        """One more piece is done, of ``total`` if given."""
         self._done += 1
         if total is not None:
             self._total = self._lines.bar.total = total
-        self._lines.bar.set_postfix_str(f"about {duration(self.left())} left", refresh=False)
         self._lines.bar.update(1)
 
-    def left(self) -> float:
-        """Seconds until the last piece is done, from the mean time of the finished pieces.
-
-        Pieces in work are half done on average, and at the end workers wait for the last piece;
-        these two cancel.
-        """
-        left = self._total - self._done
-        return left / max(1, min(self._workers, left)) * self._spent / max(1, self._done)
-
     def _status(self) -> str:
-        left = [f"about {duration(self.left())} left"] if self._done else []
-        count = f"{self._title}: {self._done} of {self._total or '?'} {self._unit}s"
-        return ", ".join([count, f"{duration(self._lines.elapsed)} elapsed", *left])
+        elapsed, done, total = self._lines.elapsed, self._done, self._total
+        left = [f"about {duration(elapsed * (total - done) / done)} left"] if done else []
+        count = f"{self._title}: {done} of {total or '?'} {self._unit}s"
+        return ", ".join([count, f"{duration(elapsed)} elapsed", *left])

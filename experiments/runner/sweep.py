@@ -148,13 +148,13 @@ def _run(plan: Plan, todo: Sequence[Request], settings: EngineSettings) -> dict[
         return ended
     ends = run_jobs(jobs, settings, min(plan.workers, len(jobs)), plan.written_ns)
     try:
-        with PartBar(plan.name, len(jobs), "job", plan.workers) as bar:
+        with PartBar(plan.name, len(jobs), "job") as bar:
             for k, record in ends:
                 job = jobs[k]
                 ended[job.config_hash] = record
                 if not record.converged:
                     say(f"failed: {job.label}: {record.reason} ({job.folder})")
-                bar.step(seconds=record.seconds_total)
+                bar.step()
     except KeyboardInterrupt:
         ends.close()
         collected(plan, ended)
