@@ -3,8 +3,8 @@
 The digest of an entry is stored as ``.NAME.sha256``. An entry without a matching digest is made
 again, even if its reader would accept it.
 
-Keys change with any code of `mvest`, and with that of the maker's package. Data files and settings
-are not code; callers describe them.
+Keys change with any code of `mvest`, and of other packages that callers name. Data files and
+settings are not code; callers describe them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -144,11 +143,10 @@ def code_digest(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def source_key(*made_by: Any) -> str:
-    """Key of all code of `mvest` and of the packages of the modules, functions or classes given."""
-    names = (made.__name__ if isinstance(made, ModuleType) else made.__module__ for made in made_by)
-    packages = sorted({"mvest", *(str(name).partition(".")[0] for name in names)})
-    folders = (Path(str(sys.modules[package].__file__)).parent for package in packages)
+def source_key(*packages: str) -> str:
+    """Key of all code of `mvest` and of further packages that are imported."""
+    names = sorted({"mvest", *packages})
+    folders = (Path(str(sys.modules[name].__file__)).parent for name in names)
     return hashlib.sha256(" ".join(map(code_digest, folders)).encode()).hexdigest()
 
 

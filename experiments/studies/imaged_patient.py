@@ -33,6 +33,7 @@ from experiments.common.cases.revealed import (
 )
 from experiments.common.schema import Values
 from experiments.common.study import Figures, Job, Result, Results, Study
+from mvest.cache import Entry
 from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence
@@ -48,7 +49,7 @@ from mvest.observation.errors import SpatialCorrelation
 from mvest.personalisation.calibration import calibrate, pairs_of
 from mvest.problem.record import UNCALIBRATED, EstimateRecord, Unknown
 from mvest.problem.registration import REGISTRATION
-from mvest.problem.stored import entry_of
+from mvest.problem.stored import key_of
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reporting.skill import HALF, skill_table, verdict_table
@@ -150,7 +151,7 @@ def make_imaged_patient(values: Values, patient: PatientSettings) -> Path:
         "seed": values["seed"],
     }
     folder = Path(values["paths"]["outputs"]) / "virtual"
-    entry = entry_of(folder, described, (_simulate, _write), _place, "{key}")
+    entry = Entry(folder / key_of(described, "experiments"), _place)
     return entry.get_or_make(
         lambda: _simulate(values, patient),
         lambda root, made: _write(root, made, patient, described),

@@ -22,28 +22,21 @@ DIGITS = 32
 """Length of a key."""
 
 
-def key_of(described: Mapping[str, Any], made_by: tuple[Any, ...]) -> str:
-    """Key of plain input values and the modules, functions or classes that use them.
+def key_of(described: Mapping[str, Any], *packages: str) -> str:
+    """Key of plain input values and the code of `mvest`, and of ``packages``, that uses them.
 
-    InputError if a value has no JSON form, or code belongs to another package.
+    InputError if a value has no JSON form.
     """
-    return config_hash({"made_from": described, "source": source_key(*made_by)})[:DIGITS]
+    return config_hash({"made_from": described, "source": source_key(*packages)})[:DIGITS]
 
 
-def entry_of(
-    folder: Path,
-    described: Mapping[str, Any],
-    made_by: tuple[Any, ...],
-    read: Callable[[Path], T],
-    name: str = "{key}.npz",
-) -> Entry[T]:
-    """The cache entry of what ``made_by`` makes from ``described``.
+def entry_of(folder: Path, described: Mapping[str, Any], read: Callable[[Path], T]) -> Entry[T]:
+    """The cache entry, an ``.npz`` file, of what `mvest` makes from ``described``.
 
-    ``described`` holds plain values: everything that decides the content, except the code. That is
-    ``made_by``: modules, functions or classes, with their imports. ``read`` reads a path or refuses
-    it. ``name`` is that of the file or folder; the folder is created with the first entry.
+    ``described`` holds plain values: everything that decides the content, except the code. ``read``
+    reads a path or refuses it. The folder is created with the first entry.
     """
-    return Entry(folder / name.format(key=key_of(described, made_by)), read)
+    return Entry(folder / f"{key_of(described)}.npz", read)
 
 
 @dataclass(frozen=True, slots=True)

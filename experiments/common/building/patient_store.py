@@ -8,9 +8,10 @@ import numpy as np
 
 from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.schema import Values
+from mvest.cache import Entry
 from mvest.cases.folder import write_case
 from mvest.errors import InputError
-from mvest.problem.stored import entry_of
+from mvest.problem.stored import key_of
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
@@ -58,7 +59,7 @@ def make_patient(values: Values, patient: PatientSettings) -> PatientPlace:
     def write(root: Path, made: tuple[VirtualPatient, int]) -> None:
         _write(root, *made, described)
 
-    entry = entry_of(folder, described, (_simulate, _write), read, "{key}")
+    entry = Entry(folder / key_of(described, "experiments"), read)
     return entry.get_or_make(lambda: _simulate(values, patient), write)
 
 

@@ -65,7 +65,7 @@ def build_truth(
         decisive = model.valve, model.contact_valve, model.mesh, settings, model.names, model.fixed
         described = {"model": content_digest(*decisive), "guided": bool(coarser)}
         folder = Path(config["paths"]["outputs"]) / "truth"
-        return model, StoredModel(model, folder, key_of(described, MADE_BY))
+        return model, StoredModel(model, folder, key_of(described, "experiments"))
 
     model, fine = on(changed)
     if not coarser:
@@ -112,10 +112,6 @@ def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
         "source": truth["source"] or mesh["source"],
         "edge_length": mesh["edge_length"] / truth["refine"],
     }
-
-
-MADE_BY = (closure_model, truth_mechanics, truth_mesh)
-"""The code whose source is part of the key of a cached closure."""
 
 
 def observation_errors(

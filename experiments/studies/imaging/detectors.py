@@ -81,9 +81,6 @@ class ImagingSettings:
     model: str | None = None  # file or "package" of detectors to test; null trains them
 
 
-SAMPLED_BY = (volume_samples, train_stage, fit_shape_model)
-
-
 def _grow(name: str, files: Sequence[Path], settings: TrainingSettings, seed: int) -> Boosters:
     """Grow one stage at a time, because samples of all stages would fill the memory."""
     samples = (read_npz(file, [f"{name}.x", f"{name}.y"]).values() for file in files)
@@ -106,8 +103,7 @@ class ImagingStore:
             "settings": asdict(self.settings.motion),
             "mechanics": asdict(self._mechanics),
         }
-        made_by = (draw_population, save_population)
-        return entry_of(self._folder / "valves", described, made_by, load_population)
+        return entry_of(self._folder / "valves", described, load_population)
 
     def population(self, which: str) -> tuple[MovingValve, ...]:
         """A population of simulated valves: ``train``, ``calibration`` or ``test``."""
@@ -123,12 +119,12 @@ class ImagingStore:
     def model_entry(self) -> Entry[DetectionModel]:
         """The cache entry of the trained detectors."""
         described = {**self._sampling(), "training": asdict(self.settings.training)}
-        return entry_of(self._folder / "models", described, (*SAMPLED_BY, save_model), load_model)
+        return entry_of(self._folder / "models", described, load_model)
 
     def samples_entry(self, number: int) -> Entry[Path]:
         """The cache entry of one training volume's samples, for any number of volumes."""
         described = {**self._sampling(), "number": number}
-        return entry_of(self._folder / "samples", described, SAMPLED_BY, lambda path: path)
+        return entry_of(self._folder / "samples", described, lambda path: path)
 
     def _sampling(self) -> dict[str, Any]:
         known = ("modes", "samples", "acquisition", "draft_volumes", "boosting")
@@ -190,7 +186,7 @@ class ImagingStore:
         entries = []
         for trial, which in zip(trials, of, strict=True):
             described = {"model": key, "trial": asdict(trial), "valves": drawn[which]}
-            entries.append(entry_of(self._folder / "trials", described, (function,), _read_trial))
+            entries.append(entry_of(self._folder / "trials", described, _read_trial))
 
         def make(missing: list[int]) -> Iterator[Any]:
             calls = (
