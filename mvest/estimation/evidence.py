@@ -56,14 +56,10 @@ class LearnedQuantity:
     name: str
     believed: LogNormal
     learned: LogNormal
+    #: Change of the logarithm's mean in standard deviations of the prior, without the resolution; 0
+    #: if the quantity is held.
+    stretch: float
     is_factor: bool = False
-
-    @property
-    def stretch(self) -> float:
-        """Change of the median in standard deviations of the prior; 0 if the quantity is held."""
-        if self.believed.factor == 1.0:
-            return 0.0
-        return float(np.log(self.learned.median / self.believed.median) / self.believed.log_std)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,6 +258,9 @@ def _quantities(
         factor = np.exp(of.std[k] * variance / (variance + least))
         return LogNormal(float(np.sqrt(variance + least)), float(factor))
 
+    def in_stds(change: float, std: float) -> float:
+        return float(change / std) if std > 0.0 else 0.0
+
     quantities, first = [], 0
     basis = next((block.basis for block in family.blocks if block.basis is not None), None)
     if basis is not None:
@@ -269,13 +268,15 @@ def _quantities(
         for name, amount in _amounts(basis).items():
             before = _log_normal(amount, prior.mean, prior.covariance)
             after = _log_normal(amount, posterior.mean, posterior.covariance)
-            quantities.append(LearnedQuantity(name, before, after))
+            change = np.log(after.median / before.median)
+            quantities.append(LearnedQuantity(name, before, after, in_stds(change, before.log_std)))
     factors = {block.frame for block in family.blocks} | {c.name for c in family.columns}
     rough = {block.rough for block in family.blocks}
     for k, name in enumerate(family.names[first:], first):
         least = family.resolution**2 if name in rough else 0.0
         before, after = (with_resolution(of, k, least) for of in (prior, posterior))
-        quantities.append(LearnedQuantity(name, before, after, name in factors))
+        stretch = in_stds(posterior.mean[k] - prior.mean[k], prior.std[k])
+        quantities.append(LearnedQuantity(name, before, after, stretch, name in factors))
     return tuple(quantities)
 
 

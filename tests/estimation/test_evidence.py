@@ -194,6 +194,17 @@ def test_intervals_hold_for_errors_other_than_stated(length: float, rough: float
         assert np.mean(nis) == pytest.approx(1.0, abs=0.01)
 
 
+def test_a_rough_part_below_the_resolution_is_moved_by_its_own_standard_deviations():
+    # It is learned to be five times as large, log 5 / log 3 of its standard deviations. With the
+    # resolution, that is 0.14 mm instead of 0.102 mm, which were expected to 4 %.
+    block, rng = NoiseBlock("rough", np.ones(4000)), np.random.default_rng(3)
+    noise = NoiseFamily((block,), {"rough": LogNormal(0.02, 3.0)}, resolution=0.1)
+    seen = np.hypot(0.1, 0.1) * rng.standard_normal(4000)
+    (rough,) = learn_noise(noise, seen, np.zeros((4000, 1))).quantities
+    assert rough.learned.median == pytest.approx(np.hypot(0.1, 0.1), rel=0.03)
+    assert rough.stretch == pytest.approx(np.log(5.0) / np.log(3.0), rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
