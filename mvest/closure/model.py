@@ -163,9 +163,9 @@ class ClosureModel:
 
         MaterialError if a modulus is inadmissible, or a parameter not finite.
         """
-        if not np.isfinite(m).all():
-            given = dict(zip(self.names, m.tolist(), strict=True))
-            raise MaterialError(f"parameters {given}: expected finite numbers")
+        for name, value in zip(self.names, m, strict=True):
+            if not np.isfinite(value):
+                raise MaterialError(f"{name} = {value}, expected a finite number")
         values = self._values(m)
         if self._system is None:
             self._system = build_system(
