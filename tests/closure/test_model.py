@@ -4,6 +4,7 @@ Everything runs on 16 x 2 cells of hex18 with a stiff posterior leaflet: enough 
 meet in a few steps. The states are not realistic; the equations are those of any mesh.
 """
 
+import re
 from dataclasses import replace
 from operator import attrgetter
 
@@ -290,7 +291,7 @@ def test_a_prediction_is_the_open_and_the_closed_frame_and_their_derivative(clos
 def test_an_inadmissible_modulus_is_a_failed_prediction(values):
     prediction = model_of(OPEN, **TINY)(np.array(values))
     assert not prediction.converged
-    assert "E_f" in prediction.reason
+    assert re.search(r"E_f\S* = (-1|0|nan)", prediction.reason)
 
 
 @pytest.mark.parametrize(

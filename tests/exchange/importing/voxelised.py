@@ -10,7 +10,8 @@ import SimpleITK
 from scipy.interpolate import PchipInterpolator
 
 from mvest.simulation.arrival import _write_label_map
-from mvest.valve.anatomy.valve import LeafletSurface, band_grid
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.valve import BandGrid, LeafletSurface, band_grid
 
 THICKNESS = 1.4
 HALF_LENGTH, HALF_WIDTH, DEPTH = 9.0, 6.0, 8.0
@@ -45,14 +46,14 @@ def small_valve(closed: bool, taller: float = 0.0) -> LeafletSurface:
     points[:, 0] *= narrowing
     if taller:
         points[:, 1] *= narrowing
-    return LeafletSurface(
-        points,
-        grid.triangles,
-        grid.region,
-        ("anterior", "posterior"),
-        np.tile([0.0, 0.0, 1.0], (len(points), 1)),
-        np.full(len(points), THICKNESS),
-    )
+    return on_grid(points, grid)
+
+
+def on_grid(points: FloatArray, grid: BandGrid) -> LeafletSurface:
+    """Two leaflets with vertices ``(n, 3)`` mm on a grid."""
+    fibre, thickness = np.tile([0.0, 0.0, 1.0], (len(points), 1)), np.full(len(points), THICKNESS)
+    names = ("anterior", "posterior")
+    return LeafletSurface(points, grid.triangles, grid.region, names, fibre, thickness)
 
 
 def voxelised(surface: LeafletSurface, voxel_mm: float) -> SimpleITK.Image:
